@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans of a recording for other programs: a readings file (.npz) or a table (.csv).
 
-They are read and written one by one, so that an hour takes no more memory than a second. A file
-has the readings of all modes that its scans have; they are NaN, or empty, where a scan has not
-read them.
+Scans are read and written one by one, so that an hour takes no more memory than a second. A file
+has the readings of all modes of its scans; where a scan has not taken a reading, it is NaN in the
+readings file, and empty in the table.
 """
 
 import math
@@ -31,16 +31,17 @@ from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_FRAMES
 from ohmskin.record.recording import Mark, Tare, messages
 
 FORMATS: Final = (".npz", ".csv")
-# What both formats have of each scan, besides its readings: attributes of `Scan`, and their types.
+# Attributes of `Scan` that both formats have besides the readings, and their types.
 _OF_SCAN: Final = {"number": "<i8", "time_us": "<i8", "host_time_s": "<f8", "missed": "<i8"}
-# Readings of a readings file: single precision has 24 bits, so codes are exact in it.
+# Type of the readings in a readings file: codes are exact in the 24 bits of single precision.
 _RATIO: Final = np.dtype("<f4")
 
 
 class Stacks(Closing):
-    """Arrays that grow row by row: in a folder, or in memory where none is given.
+    """Arrays that grow row by row.
 
     forms: type and shape of a row of each array, by its name.
+    folder: where the rows are kept, in files without a name; None: they are kept in memory.
     """
 
     def __init__(self, forms: dict[str, tuple[str, tuple[int, ...]]], folder: Path | None) -> None:
@@ -54,16 +55,17 @@ class Stacks(Closing):
             self._files[name].write(np.asarray(row, dtype=self._forms[name][0]).tobytes())
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All arrays, of stacks in memory."""
+        """All arrays. The stacks must be in memory."""
         return {
             name: np.frombuffer(self._files[name].getbuffer(), kind).reshape(-1, *shape)
             for name, (kind, shape) in self._forms.items()
         }
 
     def save(self, file: BinaryIO, more: Mapping[str, Any]) -> None:
-        """Write an .npz of all arrays, and of these others.
+        """Write all arrays, and the arrays in `more`, as an .npz.
 
-        (`np.savez` would take the memory of a whole array, by the pages of its map.)
+        (`np.savez` takes whole arrays. Even one that is mapped from a file would fill the memory,
+        page by page.)
         """
         with ZipFile(file, "w") as archive:
             for name, (kind, shape) in self._forms.items():
@@ -79,21 +81,22 @@ class Stacks(Closing):
                     npy.write_array(member, np.array(values), allow_pickle=False)
 
     def close(self) -> None:
-        """Let go what was kept. May be called again."""
+        """Throw away what was kept. May be called again."""
         for file in self._files.values():
             file.close()
 
 
 @dataclass
 class Part:
-    """The scans of a part of a recording, one by one. What else was read is here after the last.
+    """The scans of a part of a recording, one by one.
 
-    It may be iterated over again: then all is read again.
+    The attributes say what else was read; they are complete after the last scan. Each iteration
+    reads the file anew.
 
     begin_s, end_s: the part's first and last moment [s after the first scan]; 0: of the recording.
-    scans: how many there were.
+    scans: how many scans there were.
     cut_off: whether the recording was not ended properly, so that its last second may be missing.
-    boards: what the board says of itself at first.
+    boards: the first that the board says of itself, as a list of one.
     tares: all that were read.
     marks: all that were read.
     timed, watch: as `messages` takes them.
@@ -139,11 +142,11 @@ class Part:
             raise RecordingError(f"{self.path}: no scans, neither in it nor in this part of it")
 
     def tare_of(self, scan: Scan) -> Tare | None:
-        """The newest tare of such scans; None if there is none."""
+        """The newest tare so far that is good for this scan; None if there is none."""
         return next((tare for tare in reversed(self.tares) if tare.is_of(scan)), None)
 
     def error(self, text: str) -> RecordingError:
-        """That these scans do not make one file."""
+        """An error whose remedy is to choose a smaller part: `text` ends before those options."""
         return RecordingError(f"{self.path}: {text}, --begin and --end")
 
 
@@ -164,16 +167,16 @@ def save_readings(part: Part, out: Path) -> None:
 
 
 class _MoreNames(Exception):
-    """A file needs readings of these names, too: it is begun anew."""
+    """A scan has readings of names that the file does not have yet: the file is begun anew."""
 
     def __init__(self, names: set[str]) -> None:
         self.names = names
 
 
 def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
-    """Values (R, C, n) of a scan as those of the file's names (R, C, m); NaN where not read.
+    """Values (R, C, n) of a scan, in the order of the file's names (R, C, m); NaN where not read.
 
-    :raises _MoreNames: the scan has others.
+    :raises _MoreNames: the scan has readings of other names.
     """
     if scan.reading_names == names and scan.is_whole:
         return values
@@ -186,9 +189,9 @@ def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArr
 
 
 def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
-    """A readings file, and the arrays of `_OF_SCAN` besides.
+    """Write a readings file that also has the arrays of `_OF_SCAN`.
 
-    `rest_ratio` is the last tare of such scans.
+    Its `rest_ratio` is the last tare that is good for the last scan.
     """
     scans = iter(part)
     first = next(scans)
@@ -219,7 +222,10 @@ def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
 
 
 def _save_csv(part: Part, out: Path, names: tuple[str, ...]) -> None:
-    """A row a scan: its times, then the codes of each cell, named by row, column and reading."""
+    """Write a table with a row for each scan: its times, then the codes of its cells.
+
+    Columns of codes are named by row, column and reading.
+    """
     scans = iter(part)
     first = next(scans)
     cells = np.ndindex(*first.codes.shape[:2])

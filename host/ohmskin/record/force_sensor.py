@@ -9,8 +9,8 @@ line                    of
 ======================  ============================================================================
 ``12.3``                sketches for the HX711, the usual converter of load cells
 ``1042,12.3``           the same, with the time first
-``ST,GS,+  123.4 g``    scales that print by themselves; ``S S 100.00 g``, ``N + 12.3 g`` alike
-``0.1,-0.2,12.3``       force-torque sensors, by the column that the user names
+``ST,GS,+  123.4 g``    scales that print by themselves; so are ``S S 100.00 g``, ``N + 12.3 g``
+``0.1,-0.2,12.3``       force-torque sensors, of which the user names the column
 ======================  ============================================================================
 """
 
@@ -29,50 +29,51 @@ from ohmskin.record.recording import ForceSample
 
 # Speed of the sensor's line, unless the user says another. Chosen: that of most sketches.
 DEFAULT_BAUD: Final = 115_200
-# Samples that are kept for a slow reader. Chosen: 25 s of an HX711, which makes 80 a second at most
-# (its data sheet).
+# So many samples are kept for a slow reader. Chosen: 25 s of an HX711, which makes at most 80 a
+# second (its data sheet).
 QUEUE_SAMPLES: Final = 2000
-# Lines that arrive together were printed one after another, with at most so much between them: the
-# HX711 makes at least 10 samples a second (its data sheet).
+# Lines that arrive together were printed one after another, with at most this time between them
+# [s]: the HX711 makes at least 10 samples a second (its data sheet).
 _LONGEST_STEP_S: Final = 0.1
-# Times of samples rise by so much at least, even where the clock has the same time for two of them.
-# Chosen: shorter than the steps of any sensor.
+# The time of a sample is later than that of the one before by at least this, even where the clock
+# has the same time for both [s]. Chosen: shorter than the steps of any sensor.
 _SHORTEST_STEP_S: Final = 1e-6
-# Newtons of each unit [N]. Weights are those of standard gravity (CGPM, 1901).
+# One of each unit in newtons [N]. Weights are by standard gravity (CGPM, 1901).
 NEWTONS: Final = {"N": 1.0, "g": 0.00980665, "kg": 9.80665}
 _NEWTONS_BY_LOWER: Final = {unit.lower(): newtons for unit, newtons in NEWTONS.items()}
-# A number, perhaps with its unit. "nan" and "inf" are none, nor is what has more digits than any
-# sensor. Scales set signs apart.
+# A number, perhaps with its unit. "nan" and "inf" are no numbers here, nor is a text with more
+# digits than any sensor prints. Scales may print spaces after the sign.
 _NUMBER: Final = r"(?P<number>[-+]? *(?:\d{1,20}\.?\d{0,20}|\.\d{1,20})(?:E[-+]?\d{1,3})?)"
 _UNIT: Final = r"(?P<unit>kg|g|N)"
 _FIELD: Final = re.compile(rf"\s*{_NUMBER}\s*{_UNIT}?\s*", re.IGNORECASE)
-# What a scale prints says before the number whether it is stable, and gross or net; some say "?"
-# after it. What else a scale may say (that it is overloaded, a preset tare) is no force.
+# Before the number, a scale may print whether the number is stable, and whether it is gross or net;
+# some scales print "?" after it. Whatever else a scale says (that it is overloaded, a preset tare)
+# is no force.
 _STATE: Final = r"(?:(?:ST|US|S|D)[ ,]+)?(?:(?:S|D|GS|NT|G|N)[ ,]+)?"
 _OF_SCALE: Final = re.compile(rf"\s*{_STATE}{_NUMBER}(?:[\s,]*{_UNIT})?[\s?]*", re.IGNORECASE)
 _COMMAS: Final = re.compile(r"[,;\t]")
-# These may be one number with a decimal comma.
+# Two numbers with a comma between them that may be one number with a decimal comma.
 _DECIMAL_COMMA: Final = re.compile(r"[-+\s]*\d+,\d+[^.\d]*")
-# They are a time and a number if the first of the two has risen so often without a break. Chosen:
-# the whole part of a force does not, not even while somebody presses.
+# They are taken for a time and a force once the first of them has risen so often without a break.
+# Chosen: the whole part of a force does not rise so often, not even while somebody presses.
 _RISES_OF_TIME: Final = 8
-# An error text shows so many characters of a line. Chosen: enough to know it by.
+# An error shows so many characters of a line. Chosen: enough to recognise the line.
 _SHOWN_CHARS: Final = 40
 
 
 class ForceLineDecoder:
-    """Forces from what a serial sensor prints: see the module for its lines.
+    """Forces from what a serial sensor prints: the module lists the lines that it knows.
 
     newtons_per_unit: the force is so many times what a line says.
     unit: of lines that state none, a key of `NEWTONS`; "": newtons, unless other lines state one.
     column: which field of a line has the force: its name in a header, or its number from 1; "": the
-        only one, or the second of two.
+        only field, or the second of two.
 
-    What comes before the first end of a line is perhaps the end of a number: it is dropped. No more
-    than `LARGEST_LINE_BYTES` are held, whatever comes.
+    What comes before the first end of a line is dropped, because it may be the last part of a
+    number. No more than `LARGEST_LINE_BYTES` are held, whatever comes.
 
-    damaged: how many lines were no such number, blank ones and headers apart.
-    last_damaged: the newest of them, cut.
+    damaged: how many lines had no force that could be read; blank lines and headers do not count.
+    last_damaged: the newest of these lines, cut to some characters.
 
     :raises ValueError: no such unit.
     """
@@ -86,11 +87,12 @@ class ForceLineDecoder:
         self.last_damaged = ""
         self._newtons_per_unit, self._unit, self._column = newtons_per_unit, unit, column
         self._place = int(column) - 1 if column.isdecimal() else -1  # -1: no header has come
-        self._fields = 0  # of a line with columns; 0: none has come
+        self._fields = 0  # how many fields lines have; 0: none has come
         self._is_stated = False  # whether a line has stated its unit
-        self._time, self._rises = math.inf, 0  # that of the last line, perhaps, and its rises
+        # The first number of the last line, if it may be a time, and how often it has risen.
+        self._time, self._rises = math.inf, 0
         self._partial = b""
-        self._skips = True  # to the end of this line: it is the first one, or too long
+        self._skips = True  # what comes until this line ends: the line is the first, or too long
 
     def feed(self, octets: bytes) -> list[float]:
         """The forces [N] of the lines that these bytes complete, in order."""
@@ -117,7 +119,7 @@ class ForceLineDecoder:
         self.last_damaged = line[:_SHOWN_CHARS]
 
     def _is_header(self, line: str) -> bool:
-        """Whether it names the column that is wanted, whose place is noted then."""
+        """Whether a line names the column that is wanted. If so, its place is noted."""
         names = [name.strip().lower() for name in _COMMAS.split(line)]
         if not self._column or self._column.isdecimal() or self._column.lower() not in names:
             return False
@@ -125,20 +127,20 @@ class ForceLineDecoder:
         return True
 
     def _force_n(self, line: str) -> float:
-        """The force that a line states [N]; infinite: it states none, or none for sure."""
+        """The force that a line states [N]; infinite: it states none, or it is not sure which."""
         found = self._in_column(line) if self._column else self._alone(line)
         if found is None:
             return math.inf
         unit = (found["unit"] or "").lower()
         if unit:
             self._is_stated = True
-        elif self._is_stated and not self._unit:  # some scales leave it out while they are moved
+        elif self._is_stated and not self._unit:  # some scales print no unit while they move
             return math.inf
         scale = self._newtons_per_unit * _NEWTONS_BY_LOWER[unit or self._unit.lower() or "n"]
         return scale * float(found["number"].replace(" ", ""))
 
     def _in_column(self, line: str) -> re.Match[str] | None:
-        """The field of the wanted column, in a line that has as many fields as the others."""
+        """The wanted column of a line; None if the line has not as many fields as the others."""
         fields = _COMMAS.split(line)
         self._fields = self._fields or len(fields)
         if not 0 <= self._place < len(fields) == self._fields:
@@ -146,7 +148,7 @@ class ForceLineDecoder:
         return _FIELD.fullmatch(fields[self._place])
 
     def _alone(self, line: str) -> re.Match[str] | None:
-        """The number of a line that has no other, but for a time before it."""
+        """The number of a line that has only this number, or a time and this number."""
         if found := _OF_SCALE.fullmatch(line):
             return found
         time, *others = map(_FIELD.fullmatch, _COMMAS.split(line))
@@ -200,7 +202,10 @@ class ForceSensor(Closing):
         return self._decoder.damaged
 
     def take(self) -> list[ForceSample]:
-        """The samples since the last call, `QUEUE_SAMPLES` at most, times rising. Never waits.
+        """The samples since the last call, in order of time. Never waits.
+
+        If there were more than `QUEUE_SAMPLES`, the oldest of them are lost, and `dropped` counts
+        them.
 
         :raises DeviceLost: there are none, and the sensor has gone, or has printed no number for
             `SILENCE_TIMEOUT_S`.

@@ -13,7 +13,7 @@ ref_bottom_ohm          scalar
 nominal_top_wire_ohm    scalar or F                  one wire segment, per layer (optional)
 nominal_bottom_wire_ohm scalar or F
 nominal_lead_ohm        scalar or F                  from multiplexer to first crossing; 0: nothing
-ref_log_std             scalar                       what both may be off by together; absent: 0
+ref_log_std             scalar                       error that both have in common; absent: 0
 adc_bits                scalar                       absent: the readings are exact
 reading_names           n, text                      names out of a to h; absent: a b c d
 ======================= ============================ =========================================
@@ -52,14 +52,15 @@ from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import PathName, naming, require_file, whole_file
 from ohmskin.link.protocol import ENUMS
 
-# All arrays that are read of a file, together, or the readings that are written. Chosen: it fits
-# into the memory of any machine several times, and is 36 minutes of an 8x8 skin at 90 Hz.
+# The arrays that are read from a file have at most so many bytes together, and so have the readings
+# that are written to one. Chosen: any machine has several times as much memory, and it is 36
+# minutes of an 8x8 skin at 90 Hz.
 MAX_ARRAY_BYTES: Final = 200_000_000
-# A number of a file counts as so many bytes at least. Chosen: of shorter ones, the estimates of a
-# file would take more than ten times its readings.
+# A number of a file counts as at least so many bytes. Chosen: if shorter numbers counted for less,
+# the estimates of a file could take more than ten times as many bytes as its readings.
 _LEAST_ITEM_BYTES: Final = 4
-# Frames of a file. Chosen: 37 minutes at 90 Hz; what every frame costs, besides its readings, then
-# takes seconds and 100 MB.
+# A file has at most so many frames. Chosen: 37 minutes at 90 Hz. What every frame costs besides its
+# readings then takes seconds and 100 MB.
 MAX_FRAMES: Final = 200_000
 # Cells of the largest skin: 32x32. Chosen: four times those of the largest board. The estimators'
 # matrices grow with the square of it, and their time with the cube.
@@ -67,13 +68,14 @@ MAX_CELLS: Final = 1024
 # Rows of the largest skin, and columns. Chosen: four times those of the largest board. The circuit
 # of 1x1024 cells has more ports and nodes than others: its matrices take twice those of 32x32.
 MAX_LINES: Final = 64
-# The archive is read in pieces of so many bytes at most, and its directory is one piece. Chosen: a
-# directory of ten thousand arrays has a tenth.
+# The archive is read in pieces of at most so many bytes, and its directory must be one piece.
+# Chosen: a directory of ten thousand arrays has a tenth of this.
 _PIECE_BYTES: Final = 4_000_000
-# A name of a reading has four bytes. Chosen: whoever writes a wrong one shall read it in the error.
+# A name of a reading may have so many bytes. One letter has four; more are read so that an error
+# can show a wrong name. Chosen: twenty letters.
 _MOST_NAME_BYTES: Final = 80
 _NAMES: Final = tuple(ENUMS["reading"].values)
-# What may be given for each frame, and how many dimensions it has where it is given once.
+# Arrays that may be given for each frame, and how many dimensions they have if given once for all.
 _WIRES: Final = WIRE_FIELDS[:3]
 _ONCE_NDIM: Final = {"rest_ratio": 3} | dict.fromkeys(_WIRES, 0)
 _SCALARS: Final = {"ref_top_ohm", "ref_bottom_ohm", "ref_log_std", "adc_bits"}
@@ -110,7 +112,7 @@ class Readings:
         if not 1 <= frames <= MAX_FRAMES:
             raise ValueError(f"ratio has {frames} frames, not 1 to {MAX_FRAMES}: cut it into parts")
         check_size(rows, columns)
-        if not _in_range(self.ratio):  # asked of all at once, which takes no memory
+        if not _in_range(self.ratio):  # all frames at once, which is quick and takes no memory
             for frame, ratio in enumerate(self.ratio):
                 if not _in_range(ratio):
                     check_ratio(ratio, rows, columns, name=f"ratio, frame {frame},", of=names)
@@ -147,7 +149,7 @@ class Readings:
         )
 
     def _of_frame(self, name: str, frame: int) -> Any:
-        """What an array says of this frame, be it given once or for each; None if not given."""
+        """The value of an array for this frame, given for each frame or once; None if not given."""
         array = getattr(self, name)
         if array is None:
             return None
@@ -155,7 +157,7 @@ class Readings:
 
 
 def check_size(rows: int, columns: int) -> None:
-    """Raise ValueError for a skin that has no cell, or more than anything of ours estimates."""
+    """Raise ValueError for a skin that has no cell, or more cells than we estimate."""
     if not (1 <= rows <= MAX_LINES and 1 <= columns <= MAX_LINES and rows * columns <= MAX_CELLS):
         can_be = f"at most {MAX_CELLS} cells in {MAX_LINES} rows and columns"
         raise ValueError(f"no skin has {rows}x{columns} cells: {can_be}")
@@ -180,7 +182,7 @@ def load_readings(path: PathName) -> Readings:
                         arrays[name] = _read_array(archive, info, left_bytes)
                         left_bytes -= arrays[name].nbytes
             name = "reading_names"
-            if name in arrays:  # only now does numpy see whether these are letters
+            if name in arrays:  # numpy finds only here whether these are letters
                 arrays[name] = tuple(arrays[name].ravel().tolist())
         except Exception as error:  # damage may raise nearly anything in zipfile, zlib and numpy
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
@@ -193,7 +195,10 @@ def load_readings(path: PathName) -> Readings:
 
 
 class _Pieces(FileIO):
-    """A file that gives a piece at most. zipfile asks for a whole directory, of any stated size."""
+    """A file that gives at most a piece at once.
+
+    zipfile asks for the directory in one piece, whose size is whatever the file states.
+    """
 
     def read(self, size: int | None = -1, /) -> bytes:
         is_piece = size is not None and 0 <= size <= _PIECE_BYTES
@@ -201,13 +206,14 @@ class _Pieces(FileIO):
 
 
 def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, most_bytes: int) -> NDArray[Any]:
-    """An array of the archive: of text, of the real numbers that the file has, or of float64.
+    """An array of the archive: text, readings in the type that the file has, or float64.
 
-    What its header states is judged before anything else is read: then numpy reads no more.
+    What its header states is checked before anything else is read, because numpy reads as much as
+    the header states.
     """
     name = info.filename.removesuffix(".npy")
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError("it is packed by a method that numpy does not write")  # and has no bound
+        raise ValueError("it is packed by a method that numpy does not write")  # and is not bounded
     with archive.open(info) as member:
         if np.lib.format.read_magic(member) != (1, 0):  # others may have headers of gigabytes
             raise ValueError("its header is of another version than 1.0")

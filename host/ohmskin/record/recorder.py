@@ -33,22 +33,24 @@ from ohmskin.record.recording import (
     check_message,
 )
 
-# Messages are kept for so long before they are written. A recording that is killed lacks them, and
-# what came while they were written. Chosen: together less than half a second.
+# Messages are kept for so long before they are written [s]. If the recorder is killed, the file
+# lacks them, and what came while they were written. Chosen: together less than half a second.
 FLUSH_EVERY_S: Final = 0.4
 
 
 class Recorder(Closing):
     """Writes a recording, from any thread, until it is closed, removed, or the disk is full.
 
-    board: what the board says of itself. It comes first; later, the newest that was added.
-    now_s: gives the time by the clock of `Scan.host_time_s` [s]. Whoever adds a mark asks it, so
-        that all messages are on one clock, also those of a skin whose time is stepped.
-    tare: the newest that was added; None if none was.
-    force: the newest that was added; None if none was.
-    scans: how many were added.
-    missed: how many scans were missed before those.
-    forces: how many were added.
+    board: what the board says of itself, written at once; as an attribute, the newest that was
+        added.
+    now_s: gives the time by the clock of `Scan.host_time_s` [s]. Whoever adds a mark or a tare
+        takes its time from here, so that all messages are on one clock, also where the time of a
+        skin is stepped.
+    tare: the newest tare that was added; None if none was.
+    force: the newest force that was added; None if none was.
+    scans: how many scans were added.
+    missed: how many scans were missed before the scans that were added.
+    forces: how many forces were added.
     size: bytes of the file.
     failure: why nothing more is written; None as long as all is well. `add` and `close` raise it.
 
@@ -63,7 +65,7 @@ class Recorder(Closing):
         self.now_s = now_s
         self.scans = self.missed = self.forces = 0
         self.size = 0
-        self._readable = 0  # scans that are in the file for certain
+        self._readable = 0  # scans that have been written to the file
         self.board = board
         self.tare: Tare | None = None
         self.force: ForceSample | None = None
@@ -76,10 +78,11 @@ class Recorder(Closing):
             raise RecordingError(f"{path} is there already: choose another name") from None
         except OSError as exc:
             raise RecordingError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
-        # Names of the file. Where there are fewer later, somebody has removed it.
+        # The number of names that the file has. If it becomes less, somebody has removed the file.
         self._links = os.fstat(self._file.fileno()).st_nlink
-        self._epoch_ns = time.time_ns() - round(1e9 * now_s())  # from this clock to 1970
-        # `flush` ends a chunk long before it has this size.
+        # Added to a time of `now_s`, it gives the time since 1970 [ns].
+        self._epoch_ns = time.time_ns() - round(1e9 * now_s())
+        # The writer ends a chunk of this size by itself; `flush` ends it long before.
         self._writer = Writer(self._file, chunk_size=LARGEST_RECORD_BYTES // 4)
         self._flusher = threading.Thread(target=self._flush_often, name=f"flush {path}")
         try:
@@ -152,7 +155,7 @@ class Recorder(Closing):
             self._count_written()
 
     def _count_written(self) -> None:
-        """Note how far the file has got, and fail if there is none any more."""
+        """Note how much has been written. Raises RecordingError if the file was removed."""
         self._readable, self.size = self.scans, self._file.tell()
         if os.fstat(self._file.fileno()).st_nlink < self._links:
             # The system keeps a removed file until it is closed, so that writing does not fail.
@@ -164,7 +167,7 @@ class Recorder(Closing):
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """One thread at a time, and none after the file could not be written once."""
+        """Let one thread write at a time, and none after the file could not be written once."""
         with self._lock:
             if self.failure is not None:
                 raise self.failure
@@ -178,7 +181,7 @@ class Recorder(Closing):
                 raise self.failure from exc
 
     def _flush_often(self) -> None:
-        # A thread, because a board that falls silent must not keep its last scans from the file.
+        # In a thread, so that the last scans of a board get into the file even if it falls silent.
         while not self._closed.wait(FLUSH_EVERY_S):
             try:
                 self.flush()
@@ -218,8 +221,8 @@ def record(
 
     What the board says of itself is recorded whenever it changes.
 
-    tare_s: the mean of the scans of so many seconds at first is recorded as a tare, also if fewer
-        of them come; 0: no tare.
+    tare_s: the mean of the scans of the first so many seconds is recorded as a tare, even if the
+        scans end before that; 0: no tare.
     sensor: its forces are recorded beside the scans.
     beside: is called after each scan, when it is recorded.
 
@@ -243,7 +246,7 @@ def record(
         for scan in scans_for(coming, tare_s) if tare_s else ():
             keep(scan)
             untouched.append(scan)
-    finally:  # whatever ends the scans amid the tare
+    finally:  # also if the scans end, or fail, during the tare
         if untouched:
             recorder.add(Tare.of(mean_ratio(untouched), recorder.board, recorder.now_s()))
     for scan in coming:

@@ -13,8 +13,9 @@ topic          message
 /skin/force    a sample of a reference force
 =============  ===============================================================================
 
-Codes are stored as numbers, not as frames of the link: a file outlives the protocol's layout, and
-other programs can plot it. Packed, 8x8 at 90 Hz make 27 kB/s; codes that were all noise, 46 kB/s.
+Codes are stored as numbers, not as frames of the link: so a file outlives the protocol's layout,
+and other programs can plot it. In chunks, 8x8 at 90 Hz take 27 kB/s; codes that are mere noise
+would take 46 kB/s.
 ``host_time_s`` is that of `Scan`; log times are the same instants since 1970.
 
 `recorder` writes them; `messages` reads one by one, `load_recording` all at once. A file
@@ -64,29 +65,32 @@ LARGEST_RECORD_BYTES: Final = 16_000_000
 # Largest message, unpacked, without readings and with them. Chosen: a mark is a line of text, and
 # the readings of `MAX_CELLS` in a tare are 4096 numbers of at most 24 characters.
 _LARGEST_MESSAGE_BYTES: Final = (10_000, 120_000)
-# Any file may unpack to so much. Chosen: a message alone may pack better than those of a skin.
+# A file may unpack to so many bytes, whatever its size. Chosen: a single message may pack better
+# than the scans of a skin.
 _UNPACKED_BYTES: Final = 1_000_000
-# Chunks unpack to at most so many times the file's bytes, besides. Chosen: codes without noise pack
-# best, 115 times.
+# In addition, it may unpack to so many times its own bytes. Chosen: codes without noise pack best,
+# 115 times.
 _MOST_UNPACKED: Final = 130
-# No line of a board that answers delays by more. Chosen: commands are given up after a second.
+# If a board answers, its line does not delay by more than this [s]. Chosen: the host waits a second
+# for the answer to a command.
 _LARGEST_DELAY_S: Final = 10.0
 # Counters are kept in 64 bits.
 _LARGEST_COUNTER: Final = np.iinfo(np.int64).max
-# A record of a chunk counts as so many bytes at least. Chosen: what a scan of one cell, or a force,
-# takes in memory; they pack to more than ten bytes.
+# A record of a chunk counts as at least so many bytes. Chosen: a scan of one cell, or a force,
+# takes as much memory; in a file they take more than ten bytes.
 _LEAST_RECORD_BYTES: Final = 1000
-# The format, by mcap.dev/spec: what files begin with; what records begin with, opcode and length;
-# a chunk, without its times; what is before a channel's topic and before a message's content.
+# The format, by mcap.dev/spec: the first bytes of a file; the opcode and the length that each
+# record begins with; the size and CRC in a chunk, after its times; how many bytes are before the
+# topic in a channel, and before the content in a message.
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _HEAD: Final = struct.Struct("<BQ")
 _CHUNK: Final = struct.Struct("<16xQI")
 _CHANNEL_BYTES: Final = 4
 _MESSAGE_BYTES: Final = 22
-# Where in it the time is at which the message was logged [ns since 1970].
+# Where in a message's record the time is at which it was logged [ns since 1970].
 _LOG_TIME: Final = slice(6, 14)
 _READ: Final = frozenset((Opcode.FOOTER, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK))
-# What damaged bytes raise in what unpacks them.
+# What the libraries that unpack bytes raise if these are damaged.
 _DAMAGE: Final = (struct.error, UnicodeDecodeError, zstandard.ZstdError, RuntimeError, MemoryError)
 _T = TypeVar("_T")
 
@@ -106,13 +110,13 @@ class Tare:
 
     @classmethod
     def of(cls, rest_ratio: Float, board: Hello, host_time_s: float) -> Self:
-        """Means of scans of this board, in whichever of its modes they were made."""
+        """A tare from mean readings of this board, of the mode that has as many readings a cell."""
         modes = (board.mode, board.whole_mode, *MODES)
         mode = next(name for name in modes if len(MODES[name]) == rest_ratio.shape[-1])
         return cls(rest_ratio, host_time_s, mode)
 
     def is_of(self, scan: Scan) -> bool:
-        """Whether it is the rest of such scans: of the same cells, read at the same ends."""
+        """Whether it is good for this scan: of the same cells, read at the same ends."""
         same_ends = self.mode == scan.mode or is_near((*MODES[self.mode], *scan.reading_names))
         return same_ends and self.rest_ratio.shape[:2] == scan.codes.shape[:2]
 
@@ -121,9 +125,9 @@ class Tare:
 class Mark:
     """A text that somebody set.
 
-    text: any.
-    host_time_s: when, on the host's monotonic clock [s].
-    time_ns: the same, since 1970 [ns]; 0: nobody has asked for it.
+    text: any text.
+    host_time_s: when it was set, on the host's monotonic clock [s].
+    time_ns: the same since 1970 [ns]; 0: `messages` was not asked for it.
     """
 
     text: str
@@ -203,8 +207,8 @@ class Recording:
     """All of a recording, each kind of message in order.
 
     hellos: at least one.
-    scans, tares, marks, forces: perhaps none.
-    cut_off: whether it was not ended properly, so that its last second may be missing.
+    scans, tares, marks, forces: any number of each.
+    cut_off: whether the recording was not ended properly, so that its last second may be missing.
     """
 
     hellos: list[Hello]
@@ -216,7 +220,7 @@ class Recording:
 
 
 def load_recording(path: PathName) -> Recording:
-    """Read a whole recording; that of a recorder that was killed, up to its last whole chunk.
+    """Read a whole recording. If its recorder was killed, read up to the last whole chunk.
 
     :raises RecordingError: one line that names the file and what is wrong with it.
     """
@@ -234,9 +238,10 @@ def messages(
 ) -> Generator[Recorded | None, None, None]:
     """The messages of a recording in order, hello first; None last of all if it ended properly.
 
-    timed: scans and marks get their `time_ns`, which takes half as long again. watch: is told how
-    many bytes of the file were read. Topics that are not ours are passed over, so that other
-    programs may write into a recording.
+    timed: scans and marks get their `time_ns`, which takes half as long again.
+    watch: is told how many bytes of the file were read.
+
+    Topics that are not ours are passed over, so that other programs may write into a recording.
 
     :raises RecordingError: as `load_recording`.
     """
@@ -257,7 +262,8 @@ def messages(
                 elif opcode == Opcode.MESSAGE and number in topics:
                     name, octets = topics[number], content[_MESSAGE_BYTES:]
                     message = _message(name, octets)
-                    if name != "scan":  # texts, and lists of zeros, take four times their JSON
+                    # In memory, texts and lists of zeros take four times the bytes of their JSON.
+                    if name != "scan":
                         allowance.spend(3 * len(octets))
                     if not has_hello and not isinstance(message, Hello):
                         raise ValueError("no board says hello in it before the first message")
@@ -288,7 +294,7 @@ def messages(
 
 
 class _Allowance:
-    """How much may still be made of a file. Chunks and what they hold spend it."""
+    """How many bytes of memory the file may still take. Chunks and their messages spend them."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._left_bytes = _UNPACKED_BYTES + _MOST_UNPACKED * stored_bytes(file)
@@ -302,7 +308,8 @@ class _Allowance:
 def _records(file: BinaryIO, allowance: _Allowance) -> Iterator[tuple[int, bytes]]:
     """Opcodes and contents of the records that matter, up to the footer or where it was cut off.
 
-    All lengths inside of a record are lengths of what was read: none takes memory.
+    A record is read only if its length is not too large. Lengths inside of it cannot take more
+    memory: they only cut pieces from what was read.
     """
     if (magic := file.read(len(_MAGIC))) != _MAGIC:
         cut_off = "the file is cut off before its first record"
@@ -310,7 +317,7 @@ def _records(file: BinaryIO, allowance: _Allowance) -> Iterator[tuple[int, bytes
     while len(head := file.read(_HEAD.size)) == _HEAD.size:
         opcode, size = _HEAD.unpack(head)
         if not opcode:
-            return  # what a system that fell left of its last writes
+            return  # zeros, as a system that crashed leaves them in place of its last writes
         if size > LARGEST_RECORD_BYTES:
             raise ValueError(f"damaged: a record of {size} bytes, more than any recorder writes")
         if opcode not in _READ:
@@ -328,9 +335,9 @@ def _records(file: BinaryIO, allowance: _Allowance) -> Iterator[tuple[int, bytes
 
 
 def _unpacked(content: bytes, allowance: _Allowance) -> Iterator[tuple[int, bytes]]:
-    """The records of a chunk, if it states its true size, and that is not out of proportion.
+    """The records of a chunk. Raises ValueError if its stated size is false or out of proportion.
 
-    It is unpacked to one byte more than it states at most, which is enough to see that it lied.
+    At most one byte more than the stated size is unpacked: enough to see that the size is false.
     """
     size, crc = _CHUNK.unpack_from(content)
     kind, at = _text(content, _CHUNK.size)
@@ -365,7 +372,7 @@ def _text(content: bytes, at: int) -> tuple[str, int]:
 
 
 def check_message(name: str, octets: bytes) -> None:
-    """Raise ValueError if this is no message of this topic, by its size."""
+    """Raise ValueError if a message is larger than any message of this topic."""
     if len(octets) > _LARGEST_MESSAGE_BYTES["rows" in SCHEMAS[name] and name != "hello"]:
         raise ValueError(f"a message {name} of {len(octets)} bytes: no recorder writes that")
 
@@ -376,9 +383,10 @@ def _message(name: str, octets: bytes) -> Recorded:
     content = json.loads(octets)
     if not isinstance(content, dict):
         raise ValueError(f"a message {name} is no JSON object")
-    content.setdefault("mode", "near")  # recordings from before there was another do not say it
-    content.setdefault("delay_s", 0.0)  # nor this, before it was measured
-    content = layouts.today(name, content)  # of boards of then
+    # Old recordings do not state these fields: there was one mode, and delays were not measured.
+    content.setdefault("mode", "near")
+    content.setdefault("delay_s", 0.0)
+    content = layouts.today(name, content)  # boards had other fields then
     values = {key: _value(key, content[key], form) for key, form in SCHEMAS[name].items()}
     if values.get("mode", "near") not in MODES:
         raise ValueError(f"no mode {values['mode']!r:.40}: there are {', '.join(MODES)}")
@@ -391,7 +399,7 @@ def _message(name: str, octets: bytes) -> Recorded:
         values[of_cells] = _cells(of_cells, values[of_cells], shape)
         if of_cells == "codes":
             for mask, count in zip(("row_mask", "column_mask"), shape, strict=False):
-                lines_of(values[mask], count)  # raises for lines beyond
+                lines_of(values[mask], count)  # raises ValueError for lines beyond the skin
         if of_cells == "codes" and values["codes"].max() >> check_adc_bits(values["adc_bits"]):
             raise ValueError("codes: one is out of range")
     return KINDS[name](**values)
@@ -411,7 +419,8 @@ def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
     rows, columns, _ = shape
     check_size(rows, columns)
     try:
-        # As `array`, because that takes integers alone, and a third of numpy's time.
+        # `array` refuses what is no number, and for codes what is no integer. And it takes a third
+        # of the time of numpy.
         readings = array("H" if name == "codes" else "d", values)
     except (TypeError, OverflowError):
         raise ValueError(f"{name}: one is out of range") from None
@@ -421,7 +430,7 @@ def _cells(name: str, values: Any, shape: tuple[int, int, int]) -> NDArray[Any]:
 
 
 def _value(name: str, value: Any, form: dict[str, Any]) -> Any:
-    """A value, if it has this form. What arrays hold is checked in `_cells`."""
+    """A value, if it has this form. The elements of arrays are checked later, in `_cells`."""
     if form["type"] == "integer":
         least = form.get("minimum", 0)
         if type(value) is not int or not least <= value <= _LARGEST_COUNTER:

@@ -5,11 +5,11 @@ Scans come as they were recorded, with the same codes, numbers, board times and 
 the tare that was in force (``rest_ratio``), if one of its mode was recorded before it. With speed 1
 they come at the pace at which they were recorded, with 2 twice as fast. With speed 0 they come as
 fast as they are taken: then nothing is lost however slow the reader is, and `latest` gives each in
-turn. Nothing comes before somebody first asks for scans. A pause longer than `LONGEST_PAUSE_S` is
-shortened.
+turn. Nothing is played before somebody first asks for scans. A pause longer than `LONGEST_PAUSE_S`
+is shortened to it.
 
-At the recording's end iterators end, and `latest` raises `RecordingEnded`. Commands other than
-start and stop, which let the replay run and pause, raise `CommandRefused`.
+At the recording's end iterators end, and `latest` raises `RecordingEnded`. The commands start and
+stop let the replay run and pause; all others raise `CommandRefused`.
 
 ``host_time_s`` is the time of the replay, ``time_ns`` that of the recording. Marks and forces are
 not played: `ohmskin.record.recording.load_recording` has them.
@@ -34,7 +34,8 @@ LONGEST_PAUSE_S: Final = 2.0
 class Replay(Device):
     """Plays the recording `path`, `speed` times as fast as it came; 0: as fast as it is taken.
 
-    name: as it was opened. info: what the board had said when the last scan came.
+    name: the URL by which it was opened. The attribute `info` is what the board had said of itself
+    when the newest scan came.
 
     :raises RecordingError: it cannot be read.
     :raises ValueError: a negative speed.
@@ -51,7 +52,7 @@ class Replay(Device):
         assert isinstance(hello, Hello)
         self._hello = hello
         self._running = self._closing = False
-        # Of the scan before: when it was due here, and when it had been recorded [s].
+        # When the scan before was due here, and when it had been recorded [s].
         self._last: tuple[float, float] | None = None
         self._begin_thread(self._play, f"play {path}")
 
@@ -101,7 +102,7 @@ class Replay(Device):
             self._publish(replace(scan, host_time_s=time.monotonic()))
 
     def _wait_for(self, message: Hello | Scan) -> bool:
-        """Wait until somebody reads, and until a scan is due: False if the replay was closed."""
+        """Wait until somebody reads, and until the message is due. False: the replay was closed."""
         with self._changed:
             while not self._closing:
                 now_s = time.monotonic()
@@ -125,9 +126,10 @@ class Replay(Device):
         return self._last[0] + min(max(pause_s, 0.0), LONGEST_PAUSE_S)
 
     def _readers_are_behind(self) -> bool:
-        """Whether they have not yet taken what was published.
+        """Whether readers have not yet taken what was published.
 
-        Iterators have queues: half a queue lets them and the replay run side by side.
+        An iterator has a queue, and is behind if half of it is full: so it and the replay can both
+        work. `latest` has none, and is behind until it has taken the newest scan.
         """
         if self._queues:
             return any(len(queue) >= QUEUE_SCANS // 2 for queue in self._queues.values())
