@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin`` and ``python -m ohmskin``: the command line.
 
-Until it is imported, which takes half a second, Ctrl-C ends the process as it ends other programs:
-without the traceback that a KeyboardInterrupt amid an import shows. Therefore this module begins
-with what Python has built in: to import `signal` takes 10 ms, in which Ctrl-C would show one.
+Importing the command line takes half a second. Until then, Ctrl-C ends the process as it ends other
+programs: without the traceback that a KeyboardInterrupt shows during an import. So this module
+begins with `_signal`, which is built into Python: to import `signal` takes 10 ms, in which Ctrl-C
+would still show a traceback.
 """
 
 import _signal as signal  # type: ignore[import-not-found]
@@ -26,7 +27,7 @@ def main() -> None:
         sys.exit(130)
     finally:
         if _before is signal.default_int_handler:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)  # while Python ends, too
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # the same while Python ends
 
 
 if __name__ == "__main__":

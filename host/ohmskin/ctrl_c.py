@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C: what it ends, and when. Nothing else in the package handles it.
+"""Ctrl-C: what it ends, and when. No other module of the package handles it.
 
 ==================================  ==============================================  ============
 what runs                           what Ctrl-C does                                exit code
@@ -11,11 +11,11 @@ anything else                       raises KeyboardInterrupt up to `cli.main.run
 ==================================  ==============================================  ============
 
 In ``stream`` and ``estimate``, which write no file meanwhile, `ends_in_time` ends the process if
-that takes too long.
+Ctrl-C has not done so in time.
 
-Commands of the first two rows need not end by themselves: Ctrl-C is no error. Those of the second
-and third write what they read, and Ctrl-C must not come amid a write. 130 is what
-shells say of a program that Ctrl-C has ended.
+Commands of the first two rows go on until somebody ends them, so Ctrl-C is no error there. Commands
+of the second and third row write what they read, and Ctrl-C must not come in the middle of a write.
+Shells use the exit code 130 for a program that Ctrl-C has ended.
 """
 
 import os
@@ -30,15 +30,19 @@ from types import FrameType
 from typing import Final, TypeVar
 
 _T = TypeVar("_T")
-# So long after Ctrl-C, `ends_in_time` ends the process [s]. Chosen: a person waits a second.
+# `ends_in_time` ends the process so long after Ctrl-C [s]. Chosen: a person waits for a second.
 PATIENCE_S: Final = 0.7
-# A Ctrl-C that was dropped comes again after so long [s]. Chosen: the callback is over by then.
+# A Ctrl-C that Python has dropped comes again after so long [s]. Chosen: the callback that dropped
+# it is over by then.
 _AGAIN_S: Final = 0.01
 
 
 @contextmanager
 def ctrl_c_kept() -> Iterator[None]:
-    """Raise, at the latest at the end, what Ctrl-C raises: CasADi and imports may swallow it."""
+    """Raise what Ctrl-C raises, at the end of the body if not before.
+
+    Without this, CasADi or an import may swallow it.
+    """
     before, raised = signal.getsignal(signal.SIGINT), list[BaseException]()
     if not callable(before) or threading.current_thread() is not threading.main_thread():
         yield  # nothing is raised here
@@ -63,7 +67,8 @@ def ctrl_c_kept() -> Iterator[None]:
 def raise_again(dropped: "sys.UnraisableHookArgs") -> None:
     """For `sys.unraisablehook`: a Ctrl-C that Python drops comes once more, and is not printed.
 
-    It drops what a destructor or a callback of a weak reference raises: each import has one.
+    Python drops what a destructor, or a callback of a weak reference, raises. Each import has such
+    a callback.
     """
     if dropped.exc_type is KeyboardInterrupt:
         threading.Timer(_AGAIN_S, interrupt_main).start()
@@ -82,8 +87,8 @@ def ends_by_ctrl_c() -> Iterator[None]:
 def ends_in_time(leave: Callable[[], object]) -> Iterator[None]:
     """End the process, after `leave`, if Ctrl-C has not ended the body within `PATIENCE_S`.
 
-    Python raises nothing before a call of CasADi returns, which may take half a minute. So the body
-    must write nothing.
+    Without this, nothing would be raised until a call of CasADi returns, which may take half a
+    minute. As the process may end anywhere in the body, the body must write nothing.
     """
     has_ended, (reads, writes) = threading.Event(), os.pipe()
 
@@ -107,7 +112,7 @@ def ends_in_time(leave: Callable[[], object]) -> Iterator[None]:
 
 
 def until_ctrl_c(scans: Iterable[_T]) -> Iterator[_T]:
-    """Pass scans on until Ctrl-C or SIGTERM comes: they end between two, never amid a write.
+    """Pass scans on until Ctrl-C or SIGTERM comes: they end between two, and never during a write.
 
     The signal interrupts the wait for the next scan, and nothing else.
     """
@@ -138,7 +143,8 @@ def until_ctrl_c(scans: Iterable[_T]) -> Iterator[_T]:
 def forget_ctrl_c() -> None:
     """Let a program that has handled Ctrl-C end with its own exit code.
 
-    Python remembers a Ctrl-C that fell into a text that is executed, such as a dataclass's: it ends
-    the process as a signal does, handled or not, unless one more such text comes after it.
+    Python remembers a Ctrl-C that came while a text was executed, as for a dataclass. In the end it
+    then ends the process as a signal does, even if the Ctrl-C was handled, unless one more text is
+    executed after it. So one is executed here.
     """
     namedtuple("Executed", "")

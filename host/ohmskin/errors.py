@@ -5,8 +5,8 @@
 class OhmskinError(Exception):
     """Any of the errors below. Bad arguments are `ValueError` instead.
 
-    `problem`: what happened. `remedy`: what to do about it, where that is told apart. The text is
-    both.
+    `problem`: what happened. `remedy`: what to do about it; empty if `problem` says this as well.
+    The text of the error is both.
     """
 
     def __init__(self, problem: str, remedy: str = "") -> None:

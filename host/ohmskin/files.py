@@ -15,8 +15,8 @@ from secrets import token_hex
 from typing import BinaryIO, Final, Self
 
 PathName = str | os.PathLike[str]
-# A file that somebody began to write was left for good if it is so old [s]. Chosen: an hour, which
-# no file of ours takes.
+# A partial file that is so old [s] was left by a program that was killed. Chosen: an hour, which no
+# file of ours takes to write.
 _LEFT_S: Final = 3600.0
 
 
@@ -31,7 +31,7 @@ def naming(path: PathName) -> Iterator[None]:
 
 
 def read_bounded(path: PathName, most_bytes: int) -> bytes:
-    """All bytes of a file. Raises ValueError if it cannot be read, or is larger than that."""
+    """All bytes of a file. Raises ValueError if it cannot be read, or has more than these bytes."""
     try:
         with open(path, "rb") as file:
             octets = file.read(most_bytes + 1)
@@ -43,14 +43,18 @@ def read_bounded(path: PathName, most_bytes: int) -> bytes:
 
 
 def require_file(path: PathName) -> None:
-    """Raise OSError if a device or a pipe is there: readers that seek never come to its end."""
+    """Raise OSError if the path is a device or a pipe: readers that seek never come to its end."""
     mode = os.stat(path).st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # of a folder the system says what it is
+    # The system's own error, when it is opened, says that a folder is one.
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError("it is no file")
 
 
 def stored_bytes(file: BinaryIO) -> int:
-    """Bytes of a file without its holes, as far as the system knows them. It stays at its begin."""
+    """How many bytes of a file are on the disk: without holes, where the system knows of them.
+
+    The file is left at its beginning.
+    """
     stored, at, end = 0, 0, os.fstat(file.fileno()).st_size
     with suppress(OSError):  # there is nothing but a hole from there on
         while hasattr(os, "SEEK_DATA") and at < end:
@@ -71,11 +75,11 @@ def check_place(path: Path, *inputs: Path | None) -> None:
 
 @contextmanager
 def whole_file(path: PathName) -> Iterator[BinaryIO]:
-    """A file to write beside `path`, which takes its place at the end if nothing was raised.
+    """A new file beside `path` to write to. At the end it replaces `path`, if nothing was raised.
 
-    It keeps the permissions of the file that was there, and a link leads to it as before. What a
-    program that was killed has left beside it goes after `_LEFT_S`. Raises ValueError, which names
-    the path, if it cannot be written, or is there and no file.
+    It gets the permissions of the file that it replaces; if `path` is a link, its target is
+    replaced. Partial files of programs that were killed are removed once they are older than
+    `_LEFT_S`. Raises ValueError, naming the path, if it cannot be written, or is no file.
     """
     target = Path(os.path.realpath(path))
     partial = target.with_name(f".ohmskin-{token_hex(8)}.part")  # short, whatever the file's name
@@ -111,7 +115,7 @@ def save_table(path: PathName, names: Iterable[str], rows: Iterable[Iterable[obj
 
 
 class Closing(ABC):
-    """``with`` closes it on every way out."""
+    """An object that ``with`` closes, also if an error is raised inside."""
 
     @abstractmethod
     def close(self) -> None:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A live skin: a thread reads it, opens it again when it was unplugged, and programs ask at will.
 
-A program that iterates over a `CalibratedSkin` at a pace of its own, such as a robot's control loop
-of 30 Hz beside 90 scans a second, falls behind; one that asks `latest` twice waits. Here it asks
-for the newest scan, which is there, or for all scans since it last asked.
+A program may have a pace of its own, such as a robot's control loop of 30 Hz beside 90 scans a
+second. If it iterates over a `CalibratedSkin`, it falls behind; if it asks `latest`, it may have to
+wait for the next scan. Here it asks for the newest scan, which it gets at once, or for all scans
+since it last asked.
 """
 
 import threading
@@ -24,33 +25,36 @@ if TYPE_CHECKING:
     from ohmskin.record.recording import Tare
 
 # A port that is not there is tried again after this time [s]. Chosen: somebody who plugs a board in
-# does not wait for long, and a system looks for its ports without effort.
+# does not wait for long, and to try so often is no effort for a computer.
 AGAIN_S: Final = 1.0
-# A scan that has waited for longer [s] is passed over. Chosen: a machine that estimates more slowly
-# than the board scans then shows what is now, and a pause of a busy machine costs no scan.
+# A scan that has waited for longer [s] is passed over. Chosen: where estimates take longer than
+# scans, the results are still nearly new; and a short pause of a busy machine costs no scan.
 LATE_S: Final = 0.25
-# `close` waits so long for the thread [s]. Chosen: it ends in a tenth of that, unless its port
-# never answers, and such a port must not hold up the end of the program.
+# `close` waits at most so long for the thread [s]. Chosen: the thread ends in a tenth of this time,
+# unless its port never answers, and such a port must not hold up the end of the program.
 _CLOSE_S: Final = 1.0
-# Boards that agree in all of these, and in whether they read far ends, read the same skin: method,
-# rest and tare stay good.
+# Boards that agree in all of these read the same skin in the same way: method, rest and tare stay
+# good.
 _skin_of: Final = attrgetter(
     "unit_id", "rows", "columns", "reads_far", "ref_top_ohm", "ref_bottom_ohm", "adc_bits"
 )
 
 
 class LiveSkin(Closing):
-    """A skin that is always read. All may be called from any thread.
+    """A skin that is read all the time. All methods may be called from any thread.
 
-    port, calibration, force: as `ohmskin.open` takes them. A board that is not there, or goes away,
-    is opened again and again; the latest tare and the learned wires stay. every: False estimates
-    the newest scan whenever the one before is done, and no other: what only shows a skin is then
-    as soon as it can be, on a busy machine too.
+    A board that is not there, or goes away, is opened again and again. The latest tare and the
+    wires that were learned stay.
+
+    port, calibration, force: as `ohmskin.open` takes them.
+    every: whether every scan is estimated. False: only the newest, whenever the estimate before it
+        is done. A program that only shows the skin then shows it as soon as it can be, on a busy
+        machine, too.
 
     >>> with LiveSkin("/dev/ttyACM0", "skin.json") as skin:
-    ...     count, scans = skin.since(0, timeout_s=5.0)  # all until now
-    ...     count, scans = skin.since(count)  # those that came since
-    ...     newest = skin.newest()  # None: none has come yet
+    ...     count, scans = skin.since(0, timeout_s=5.0)  # all scans until now
+    ...     count, scans = skin.since(count)  # the scans that have come since
+    ...     newest = skin.newest()  # None: no scan has come yet
 
     :raises ValueError: the calibration cannot be read.
     """
@@ -71,7 +75,7 @@ class LiveSkin(Closing):
         self.opened = 0
         """How often the port was opened."""
         self.ended = False
-        """Whether the thread has ended: a recording was played, `close` was called, or a defect."""
+        """Whether the thread has ended: with its recording, by `close`, or by a defect of ours."""
         self.watchers: set[Callable[[], None]] = set()
         """They are called when there is news, from the thread that reads: they must not wait."""
         self.closing = threading.Event()
@@ -93,9 +97,11 @@ class LiveSkin(Closing):
             return self._kept[-1] if self._kept else None
 
     def since(self, count: int, timeout_s: float = 0.0) -> tuple[int, list[ForceScan]]:
-        """Every scan after the first `count` of them, each once; and the count to ask with next.
+        """The count to ask with next, and every scan after the first `count` scans, each once.
 
-        The newest `QUEUE_SCANS` are kept. timeout_s: waits so long [s] where there is none yet.
+        Only the newest `QUEUE_SCANS` scans are kept.
+
+        timeout_s: how long to wait [s] if there is no such scan yet.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._count > count or self.ended, timeout_s)
@@ -103,7 +109,7 @@ class LiveSkin(Closing):
             return self._count, list(islice(self._kept, begin, None))
 
     def __iter__(self) -> Iterator[ForceScan]:
-        """Every scan from now on, through all that is unplugged, until `close`."""
+        """Every scan from now on, until `close`; also after the board was away."""
         count = self._count
         while not self.ended:
             count, scans = self.since(count, SILENCE_TIMEOUT_S)
@@ -114,9 +120,9 @@ class LiveSkin(Closing):
         return in_threads(self)
 
     def there(self) -> tuple[Device, SkinReader]:
-        """The open board, and the reader of its skin, which knows tares.
+        """The open board, and the reader of its skin, which knows the tares.
 
-        :raises DeviceLost: it is not open.
+        :raises DeviceLost: the board is not open.
         """
         device, reader, failure = self._device, self._reader, self.failure
         if device is None or reader is None:
@@ -172,7 +178,8 @@ class LiveSkin(Closing):
                 if reader is None or _skin_of(reader.board) != _skin_of(board):
                     self._reader = reader = self._new_reader(board)
                     reader.warm_up()
-                device.only_unit = board.unit_id  # another is opened anew, with its calibration
+                # Another unit at this port ends the device, and is then opened by this method.
+                device.only_unit = board.unit_id
                 self._device = device
                 self.opened += 1
                 for scan in device if self._every else iter(device.latest, None):

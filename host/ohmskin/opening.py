@@ -6,12 +6,13 @@
 ``emulator://8x8?scene=ghost``      an emulated board, in this process (`ohmskin.emulate`);
                                     ``speed=0``: its time passes as fast as its scans are taken
 ``simavr://uno?scene=ghost``        the built firmware, run by an AVR simulator in real time
-``replay://FILE.mcap?speed=1``      a recording (`ohmskin.record.replay`); 0: as fast as it is taken
+``replay://FILE.mcap?speed=1``      a recording (`ohmskin.record.replay`); ``speed=0``: it is played
+                                    as fast as its scans are taken
 ``socket://robot:4000``             a serial port of another computer, behind ser2net or socat
                                     (pyserial opens it); ``rfc2217://`` sets its speed, too
 ==================================  ==========================================================
 
-What only one kind needs is imported when that kind is opened.
+Modules that only one kind of port needs are imported when such a port is opened.
 """
 
 from __future__ import annotations
@@ -57,10 +58,12 @@ def open(
 ) -> Device | CalibratedSkin:
     """Connect to a board, and start scanning unless told otherwise.
 
-    calibration: a `Calibration` or the path of its file; scans then carry forces. force: take it
-    even if it is of another unit. focus: while somebody iterates, a region around the contacts is
-    read, hundreds of times a second, and the whole skin `focus.WHOLE_HZ` times. A `Region` says
-    how: ``Region(settle_us=20)`` reads 3x3 cells a thousand times, less well where lines charge.
+    calibration: a `Calibration` or the path of its file; scans then carry forces.
+    force: take the calibration even if it is of another unit.
+    focus: while somebody iterates, a region around the contacts is read hundreds of times a second,
+        and the whole skin `focus.WHOLE_HZ` times a second. A `Region` says how the region is read:
+        ``Region(settle_us=20)`` reads 3x3 cells a thousand times a second, but less exactly where
+        lines take time to charge.
 
     >>> with open("emulator://8x8?scene=ghost") as skin:
     ...     skin.latest().ratio.shape
@@ -73,7 +76,7 @@ def open(
     :raises RecordingError: the recording of a ``replay://`` port cannot be read.
     :raises ValueError: the calibration cannot be read, or is of another unit or geometry.
     """
-    # First, because a board may take seconds to boot, and a wrong file is known at once.
+    # The file first: a board may take seconds to boot, and a wrong file is known at once.
     of_skin = None if calibration is None else loaded(calibration)
     with ExitStack() as opened:
         device = opened.enter_context(_device(os.fspath(url)))
@@ -97,7 +100,7 @@ def _device(text: str) -> Device:
     match url.scheme:
         case "" | "socket" | "rfc2217":
             url.check_options("baud")
-            baud = url.baud  # which a wrong URL fails at, before a port is opened
+            baud = url.baud  # raises for a wrong URL, before a port is opened
             return Session(SerialLink(text.partition("?")[0]), baud)
         case "emulator":
             from ohmskin.emulate.urls import open_emulator

@@ -54,12 +54,14 @@ class Boards(Closing, dict[int, _Skin], Generic[_Skin, _Scan]):
     def scans(self) -> Iterator[BoardScan[_Scan]]:
         """Every scan of every board from now on, in order of `Scan.time_ns`.
 
-        A scan is given when every other board has sent a later one: late by about a period of the
-        slowest board. A program for which that is too late reads each device's `latest`.
+        A scan is given only when every other board has sent a later one. So it comes late, by about
+        a period of the slowest board. A program for which this is too late reads each device's
+        `latest`.
 
         :raises DeviceLost: one of the boards went away; its text names the port.
         """
-        # All boards begin now. The merge would begin each of them when it first takes a scan of it.
+        # The iterators begin here, all boards at once. The merge would begin each of them only when
+        # it first takes a scan of its board.
         begun = [cast("Iterator[_Scan]", iter(device)) for device in self.values()]
         of_boards = map(_named, self, begun)
         return heapq.merge(*of_boards, key=lambda board_scan: board_scan.scan.time_ns)
@@ -97,9 +99,10 @@ def open_all(
     """Connect to several boards, all of these or none, and start scanning unless told otherwise.
 
     urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of an Uno or a
-    Mega 2560. A port of these that does not answer as a skin is skipped: it is another device. A
-    skin that cannot be used, because its port is busy or its firmware is of another version, is an
-    error. calibrations: `Calibration` or files; each board takes the one of its unit id.
+        Mega 2560. Such a port is skipped if no skin answers at it: it is another device. A skin
+        that cannot be used, because its port is busy or its firmware is of another version, is an
+        error.
+    calibrations: each a `Calibration` or a file; each board takes the one of its unit id.
 
     >>> with open_all(["emulator://8x8?unit=1", "emulator://8x8?unit=2"]) as skins:
     ...     sorted(skins)
@@ -126,7 +129,7 @@ def open_all(
                 raise
             return device if by_unit is None else _calibrated(device, by_unit)
 
-        # At once, because each takes as long as its board to boot.
+        # All at the same time, because each takes as long as its board takes to boot.
         with ThreadPoolExecutor(len(ports)) as pool:
             devices = [device for device in pool.map(connect, ports) if device is not None]
         if not devices:
