@@ -36,31 +36,32 @@ from ohmskin.live import LiveSkin
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
 
-# The methods that the page offers. Those of the paper take minutes for a frame of 8x8.
+# The methods that the page offers: all but those of the paper, which take minutes for an 8x8 frame.
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
-# What boards, estimates and contacts need later: see `load_all`.
+# Modules that boards, estimates and contacts need later: see `load_all`.
 _NEEDED_LATER: Final = (
     *("ohmskin.emulate.urls", "ohmskin.record.replay"),
     *("scipy.ndimage", "scipy.optimize", "scipy.sparse.csgraph"),
 )
-# A page has at most so many boards. Chosen: each is a thread that may use a good part of a core.
+# A page has at most so many boards. Chosen: each has a thread that may use a good part of a core.
 MOST_BOARDS: Final = 16
 # A text that is typed at the page, a port or a mark, has at most so many characters. Chosen: far
 # longer than anybody types, and short enough for a line of an error.
 LONGEST_TEXT_CHARS: Final = 1000
-# What the page says of a board.
+# Attributes of `Hello` that the page shows of a board.
 _OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns", "mode")
-# What it says of a contact.
+# Numbers of a `Contact` that the page shows.
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
 
 
 class Shown(NamedTuple):
-    """One scan of a page: its number, and what the page is sent.
+    """One scan as a page shows it: its number, and the message that the page is sent.
 
     ==============  ==================================================================
     4 bytes         length of the header, little-endian
     header          JSON, padded with spaces to a multiple of 4 bytes
-    planes          those that the header names, each R x C float32, little-endian, by row
+    planes          in the order of "planes" in the header, each R x C float32, little-endian, by
+                    row
     ==============  ==================================================================
     """
 
@@ -71,8 +72,8 @@ class Shown(NamedTuple):
 def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, more: dict[str, Any]) -> Shown:
     """What the page is sent of a scan.
 
-    raw: what `ohm` makes of the near electrodes' readings: it has ghosts, which the page shows
-        beside the scan's own estimate.
+    raw: what `ohm` makes of the readings at near ends. It has ghosts, and the page shows it beside
+        the scan's own estimate.
     has_forces: whether the scan's forces are newtons.
     more: further fields of the header.
     """
@@ -112,8 +113,8 @@ def _number(value: float) -> float | None:
 class _Recording(Closing):
     """Records `skin` in a thread of its own, until it is closed or the board is gone.
 
-    ended: is called, from that thread, when the file is whole.
-    text: how it went; empty for as long as it goes on.
+    ended: is called when the file is whole, from the thread of the recording.
+    text: how the recording went; empty while it goes on.
     """
 
     def __init__(self, skin: Device, recorder: Recorder, ended: Callable[[], None]) -> None:
@@ -127,7 +128,7 @@ class _Recording(Closing):
         trouble = ""
         try:
             with self.recorder as recorder:
-                # Scans that came before somebody ended it are kept, also if they still wait.
+                # Scans that came before `close` was called are kept, even if they still wait.
                 in_time = takewhile(lambda scan: scan.host_time_s <= self._until_s, skin)
                 record(skin, recorder, in_time)
         except OhmskinError as exc:
@@ -145,11 +146,13 @@ class _Recording(Closing):
 class ViewedBoard(LiveSkin):
     """The board at `port`, whether it is there or not, as the page shows and commands it.
 
-    The page calls the methods from its own threads; all but `state` may wait for the board.
+    The page calls the methods from its own threads; all but `state` may wait for the board. A
+    method that is a command returns a text that says what was done, and raises an error that says
+    why it was not.
 
     port: a serial port or a URL.
     calibrations: the first that fits the board gives its forces.
-    folder: where recordings go.
+    folder: where recordings are written.
     force: a calibration of another unit fits, too.
     """
 
@@ -157,17 +160,17 @@ class ViewedBoard(LiveSkin):
         self, port: str, calibrations: Sequence[Calibration], folder: Path, *, force: bool = False
     ) -> None:
         self.shown: Shown | None = None
-        """What the newest scan shows; None while nobody looks."""
+        """The newest scan as it is shown; None while no page shows this board."""
         self._calibrations, self._folder = calibrations, folder
         self._note = ""  # why there are no forces, although calibrations were given
         self._recording: _Recording | None = None
-        # Held by commands that read or change both the rest and the recording: a recording begins
-        # with the tare that is in force, and takes each later one.
+        # Held by each command that reads or changes the rest or the recording: a recording begins
+        # with the tare that is in force, and gets each later tare.
         self._commands = threading.Lock()
         super().__init__(port, None, force=force, every=False)
 
     def state(self) -> dict[str, Any]:
-        """What the page says beside the scans, as JSON has it."""
+        """What the page shows besides the scans, as values for JSON."""
         reader, recording, running = self._reader, self._recording, self._running()
         board = None if reader is None else reader.board
         rest = None if reader is None else reader.rest
@@ -191,7 +194,7 @@ class ViewedBoard(LiveSkin):
         }
 
     def use(self, method: str) -> str:
-        """Estimate by another method. Commands return what was done, and raise why it was not."""
+        """Estimate by another method."""
         _, reader = self.there()
         if method not in (*LIVE_METHODS, reader.force_method):
             raise ValueError(f"no method '{method[:40]}': there are {', '.join(_methods(reader))}")
@@ -238,7 +241,8 @@ class ViewedBoard(LiveSkin):
             if (running := self._running()) is not None:
                 raise OhmskinError(f"{running.recorder.path} is being recorded already")
             recorder = Recorder(self._new_file(reader.board.unit_id), skin.info)
-            if reader.is_tared and reader.rest is not None:  # a replay then begins with it, too
+            # With the rest that is in force now, so that a replay begins with the same rest.
+            if reader.is_tared and reader.rest is not None:
                 recorder.add(Tare.of(reader.rest.ratio, reader.board, time.monotonic()))
             self._recording = _Recording(skin, recorder, self._tell)
         return "recording: every scan, whatever is shown"
@@ -262,7 +266,7 @@ class ViewedBoard(LiveSkin):
 
     @contextmanager
     def _one_at_a_time(self) -> Iterator[None]:
-        """Do a command, unless another is being done: that is refused, and not waited for."""
+        """Let the body run, unless another command is running: then raise, and do not wait."""
         if not self._commands.acquire(blocking=False):
             raise OhmskinError("one thing at a time: the last one is not done yet")
         try:
@@ -272,26 +276,26 @@ class ViewedBoard(LiveSkin):
             self._tell()
 
     def _running(self) -> _Recording | None:
-        """The recording that goes on; None where the last one has ended, or none was begun."""
+        """The recording that is going on; None: the last one has ended, or none was begun."""
         recording = self._recording
         return None if recording is None or recording.text else recording
 
     def _add(self, kept: Tare | Mark) -> bool:
-        """Add it to the recording that goes on; whether one does."""
+        """Add a message to the recording that is going on. Returns whether there is one."""
         if (recording := self._running()) is not None:
             recording.recorder.add(kept)
         return recording is not None
 
     def _new_file(self, unit_id: int) -> Path:
-        """A name by date, time and unit; a number ends it where two begin in one second."""
+        """A new file, named by date, time and unit; a second one of the same second gets "-2"."""
         name = f"ohmskin-{datetime.now():%Y%m%d-%H%M%S}-unit{unit_id}"
         paths = (self._folder / f"{name}{f'-{n}' if n > 1 else ''}.mcap" for n in count(1))
         return next(path for path in paths if not path.exists())
 
     def _new_reader(self, board: Hello) -> SkinReader:
-        """Calibrations are tried in their order.
+        """A reader with the first calibration that fits the board.
 
-        Where none fits, there are no forces, and the page notes why the last one does not.
+        If none fits, there are no forces, and the page says why the last calibration does not.
         """
         self._raw = make_estimator("ohm", SkinKnowledge.of(replace(board, mode="near")))
         self._note = note = ""
@@ -308,7 +312,8 @@ class ViewedBoard(LiveSkin):
             # An estimate takes a good part of a core: none is made while nobody looks.
             self.shown = None
             return
-        read, running = reader.read(scan), self._running()  # the method may be another from now on
+        # The scan is read first: the method of the reader may be another one after that.
+        read, running = reader.read(scan), self._running()
         more = {
             "method": reader.method,
             "missed": device.stats.missed,
@@ -324,16 +329,17 @@ class ViewedBoard(LiveSkin):
             recording.close()
 
     def close(self) -> None:
-        """End reading; a recording is whole then. May be called again."""
+        """End reading. A recording is whole after that. May be called again."""
         self._end_focus()
         super().close()
         self._gone()
 
 
 def load_all() -> None:
-    """Import what is otherwise imported when it is first needed, which may fail later.
+    """Import what would otherwise be imported when it is first needed, which may fail then.
 
-    A module is a file, and a program that has many connections may have no descriptor left.
+    To import a module, Python opens its file, and a program with many connections may have no file
+    descriptor left.
     """
     for method in LIVE_METHODS:
         kind_of(method)
@@ -378,7 +384,7 @@ class ViewedBoards(Closing, dict[int, ViewedBoard]):
             if board.port == port:
                 return number
         if is_stepped(port):
-            # Its scans are on a clock of their own, so a recording would never see its end.
+            # Its scans have times of their own clock, by which a recording would never end.
             raise ValueError("a page has real time: leave out speed=0")
         if len(self) >= MOST_BOARDS:
             raise ValueError(f"there are {MOST_BOARDS} boards: close one first")
@@ -393,5 +399,5 @@ class ViewedBoards(Closing, dict[int, ViewedBoard]):
 
     def close(self) -> None:
         """Close all. May be called again."""
-        with ThreadPoolExecutor(MOST_BOARDS) as pool:  # some may have to be waited for
+        with ThreadPoolExecutor(MOST_BOARDS) as pool:  # at once: some boards take time to close
             list(pool.map(self.remove, tuple(self)))

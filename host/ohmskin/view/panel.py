@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """One panel of a page: a websocket over which a board is shown and commanded.
 
-To the page go texts (JSON), of ``kind`` state, notice or clock, and scans (bytes: `Shown.message`).
-The newest scan is sent, and no other before the page has acknowledged it, so nothing queues up.
-From the page come texts, whose ``do`` is a command of `Panel._asked`, "ack" with ``scan``, or
-"clock" with ``page_ms``, to which the answer tells the host's clock.
+The page is sent texts (JSON) whose ``kind`` is state, notice or clock, and scans (bytes:
+`Shown.message`). Always the newest scan is sent, and the next one only after the page has
+acknowledged it, so that nothing queues up. The page sends texts (JSON) whose ``do`` is a command of
+`Panel._asked`, "ack" with ``scan``, or "clock" with ``page_ms``, which is answered by the host's
+clock.
 """
 
 import asyncio
@@ -21,14 +22,14 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDiscon
 from ohmskin.errors import OhmskinError, TareRefused
 from ohmskin.view.boards import Shown, ViewedBoard
 
-# The close code of a websocket whose board was closed, by this page or another. Chosen from 4000 to
-# 4999, which RFC 6455 leaves to programs; page/wire.js knows it.
+# The close code of a websocket whose board was closed, by this page or by another. page/wire.js has
+# the same. Chosen: one of 4000 to 4999, which RFC 6455 leaves to programs.
 _GONE_CODE: Final = 4001
-# No page's clock shows more [ms]. Chosen: a page counts from its begin, and 1e15 ms are 30,000
-# years; a number that JavaScript reads as infinite must not be sent back.
+# A larger time of a page's clock is not sent back [ms], because JavaScript reads numbers that are
+# too large as infinite. Chosen: a page counts from its beginning, and 1e15 ms are 30,000 years.
 _MOST_MS: Final = 1e15
-# A page may have so many commands under way. Chosen: more than anybody gives in a second; a tare
-# takes one.
+# A page may have so many commands under way. Chosen: more than anybody gives in a second, which is
+# what a tare takes.
 MOST_COMMANDS: Final = 4
 _Command = Callable[[], str]
 
@@ -45,7 +46,7 @@ class Panel:
         self._awaited: int | None = None  # number of the scan that is not yet acknowledged
 
     async def serve(self) -> None:
-        """Returns when it is over."""
+        """Serve it. Returns when the page or the board has gone."""
         await self._socket.accept()
         loop = asyncio.get_running_loop()
 
@@ -58,7 +59,7 @@ class Panel:
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send)
                 tasks.start_soon(self._receive, tasks)
-        except* (WebSocketDisconnect, WebSocketDisconnected):  # seen, or seen by the other task
+        except* (WebSocketDisconnect, WebSocketDisconnected):  # the page or the board has gone
             pass
         finally:
             self._board.watchers.discard(wake)
@@ -84,10 +85,11 @@ class Panel:
         await self._deliver(self._socket.send_text(json.dumps({"kind": kind, **content})))
 
     async def _deliver(self, sending: Awaitable[None]) -> None:
-        """Send. A connection that the server has closed is gone, as one that the page has closed.
+        """Send. If the server has closed the connection, raise as if the page had closed it.
 
-        The server closes it by itself after a message that is too long, and says so in `receive`.
-        A scan that is sent just before that meets an error that only its text tells from a fault.
+        The server does so after a message that is too long, and `receive` tells it to the other
+        task. If a scan is sent before that, starlette raises a RuntimeError, and only the text of
+        this error shows that the connection was closed.
         """
         try:
             await sending
@@ -98,7 +100,7 @@ class Panel:
 
     async def _receive(self, tasks: TaskGroup) -> None:
         while True:
-            await asyncio.sleep(0)  # others come to their turn, however much this page says
+            await asyncio.sleep(0)  # lets other tasks run, however much this page sends
             received = await self._socket.receive()
             if received["type"] == "websocket.disconnect":
                 raise WebSocketDisconnect(received.get("code", 1000))
@@ -117,7 +119,7 @@ class Panel:
                     await self._take(self._asked(message), tasks)
 
     async def _take(self, command: tuple[str, _Command] | None, tasks: TaskGroup) -> None:
-        """Begin a command, unless it is none or too many are under way."""
+        """Begin a command, unless it is unknown (None) or too many are under way."""
         if command is not None and self._under_way < MOST_COMMANDS:
             self._under_way += 1
             tasks.start_soon(self._run, *command)

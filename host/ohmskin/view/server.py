@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The server of the page: a few files, the list of boards, a websocket for each panel.
 
-It answers its own page alone, with the token that is in the address: other users of this machine
-must neither read the skin nor command it, and no page of another site must. A browser says in
-``Origin`` which page asks, and in ``Host`` which name it asked for: a foreign page is refused, and
-so is, on loopback, a foreign name that was made to lead here (DNS rebinding).
+It answers its own page alone, which has the token of the address. Neither other users of this
+machine nor pages of other sites may read or command the skin. A browser says in ``Origin`` which
+page asks: another page is refused. And it says in ``Host`` which name it asked for. On loopback,
+names of other machines are refused: somebody has made such a name lead here (DNS rebinding).
 """
 
 import json
@@ -34,15 +34,15 @@ from ohmskin.view.boards import LONGEST_TEXT_CHARS, MOST_BOARDS, ViewedBoards, l
 from ohmskin.view.connections import Server, Waiting
 from ohmskin.view.panel import Panel
 
-# The port at which the page is, unless told. Chosen: few other programs use it.
+# The port of the page, unless told. Chosen: few other programs use it.
 HTTP_PORT: Final = 8765
-# So many ports from there on are tried. Chosen: nobody has as many pages open.
+# So many ports are tried, from this one on. Chosen: nobody has as many pages open.
 _PORTS_TRIED: Final = 100
 _PAGE: Final = Path(__file__).parent / "page"
 # A page's message has at most so many bytes. Chosen: a text of `LONGEST_TEXT_CHARS` has at most
 # 4000 in UTF-8, and names are added.
 _LONGEST_MESSAGE_BYTES: Final = 8192
-# Connections that are open when the server ends have so long to close [s]. Chosen: a page on this
+# When the server ends, open connections have so much time to close [s]. Chosen: a page on this
 # machine takes milliseconds, and nobody likes to wait after Ctrl-C.
 _SHUTDOWN_S: Final = 2
 # What a browser lets the page do: load its own files, talk to its own server, and nothing else.
@@ -57,17 +57,17 @@ _HEADERS: Final = {
     "cache-control": "no-store",  # a page of one version never meets a server of another
     "connection": "close",  # a page asks for so little that none needs to be kept
 }
-# There are at most so many panels, on all pages. Chosen: four pages of as many boards as there can
-# be; each takes a descriptor, and what is sent to each takes time.
+# All pages together have at most so many panels, because each takes a file descriptor, and time to
+# be sent to. Chosen: four pages of as many boards as there can be.
 MOST_PANELS: Final = 4 * MOST_BOARDS
-# Names of this machine for itself. A page that was asked for by another name was made to lead here.
+# The names by which this machine calls itself.
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 # Requests that change nothing. Browsers need not say in ``Origin`` which page sends them.
 _READS: Final = ("GET", "HEAD")
 
 
 class _BoardList:
-    """What the page asks for beside its own files: ports, the list of boards, and their panels."""
+    """Answers what the page asks for besides its files: ports, the list of boards, their panels."""
 
     def __init__(self, boards: ViewedBoards) -> None:
         self._boards = boards
@@ -85,7 +85,7 @@ class _BoardList:
 
     async def ports(self, _: Request) -> Response:
         """The serial ports of this machine."""
-        # In a thread, because some systems take long to look for them.
+        # In a thread, because on some systems it takes long to look for ports.
         ports = await anyio.to_thread.run_sync(serial_ports)
         return JSONResponse([asdict(port) for port in ports])
 
@@ -140,13 +140,13 @@ def make_app(
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[dict[str, Waiting]]:
         await anyio.to_thread.run_sync(load_all)
-        started()  # from here on, Ctrl-C ends the server in order
+        started()  # from here on, Ctrl-C lets the server end properly
         yield {"waiting": Waiting()}
         await anyio.to_thread.run_sync(boards.close)
 
     mimetypes.add_type("text/javascript", ".js")  # some systems know it by another name
     files = [_file(file) for file in sorted(_PAGE.iterdir())]
-    # A page asks for its own parts without its token.
+    # A browser asks for the parts of a page without the token.
     public = [file.path for file in files if file.path != "/"]
     return Starlette(
         routes=[*_BoardList(boards).routes(), *files],
@@ -156,7 +156,7 @@ def make_app(
 
 
 def _file(file: Path) -> Route:
-    """A file of the page. It is read once: a request needs no descriptor but its own."""
+    """A file of the page. It is read once, so that a request needs no file descriptor for it."""
     content, kind = file.read_bytes(), mimetypes.guess_type(file.name)[0]
 
     async def send(_: Request) -> Response:
@@ -191,7 +191,7 @@ def _listen(host: str, port: int | None) -> socket.socket:
     for tried in range(HTTP_PORT, HTTP_PORT + _PORTS_TRIED):
         with suppress(OSError):
             return socket.create_server((host, tried), family=family)
-    return _listen(host, HTTP_PORT)  # says why not
+    return _listen(host, HTTP_PORT)  # raises an error that says why
 
 
 def serve(
@@ -219,9 +219,10 @@ def serve(
 class Guard:
     """ASGI middleware that refuses strangers.
 
-    host: the address listened at; on loopback, the name in ``Host`` must be one of this machine.
-    Its port is not checked: it is another one through an SSH tunnel. token: what has to be in the
-    query. public: paths that need no token, because a page asks for its own parts without one.
+    host: the address at which the server listens. On loopback, the name in ``Host`` must be one of
+        this machine. The port in ``Host`` is not checked: through an SSH tunnel it is another one.
+    token: must be in the query.
+    public: paths that need no token, because a browser asks for the parts of a page without it.
     """
 
     def __init__(self, app: ASGIApp, host: str, token: str, public: Collection[str]) -> None:
