@@ -11,7 +11,7 @@ Not modelled:
 - findings of the self-test, and its readings g and h: the board itself is sound (`SkinFaults` are
   faults of the skin).
 
-``simavr://`` has all these, for it runs the firmware itself.
+``simavr://`` has all this, because it runs the firmware itself.
 """
 
 import math
@@ -32,14 +32,15 @@ from ohmskin.version import VERSION
 
 # Readings of the skin: (time since the board was switched on [s], mode) -> (rows, columns, n).
 RatioAt = Callable[[float, str], Float]
-# What the converter makes of them: (readings, start of the scan [s], slot [s], settle time [s],
-# mode) -> readings. A scan takes one reading a slot, each that settle time after the pins changed.
+# What the converter makes of the skin's readings: (readings, start of the scan [s], slot [s],
+# settle time [s], mode) -> readings. A scan takes one reading in each slot. It is taken when the
+# settle time has passed since the pins changed.
 Sampled = Callable[[Float, float, float, float, str], Float]
 
-# Numbers of the firmware, by which `hello` answers as a real board does. That they are those of its
-# source is tested in tests/emulate/test_emulator.py.
+# Numbers of the firmware, so that the emulated board answers as a real one.
+# tests/emulate/test_emulator.py compares them with the firmware's source.
 #
-# The version that hello says: as a board's firmware, an emulated board has that of the package.
+# The version that hello says: like a board's firmware, an emulated board has that of the package.
 _VERSION_FIELDS: Final = ("version_major", "version_minor", "version_patch")
 _VERSION: Final = dict(zip(_VERSION_FIELDS, map(int, VERSION.split(".")), strict=True))
 # The processor's clock on an Uno and a Mega 2560 [Hz] (Arduino's data sheets).
@@ -50,22 +51,23 @@ DEFAULT_RATE_HZ: Final = 90.0
 SLOT_CYCLES_MAX: Final = 60_000
 # A slot is not shorter than this [ADC clocks], so that a conversion ends in it (scan_plan.h).
 SLOT_ADC_CLOCKS_MIN: Final = 15
-# From the hold of a reading to the end of its conversion, the sample capacitor is off the skin for
-# this time [ADC clocks] (scan_plan.h).
+# The sample capacitor is off the skin for this time, from the hold of a reading to the end of its
+# conversion [ADC clocks] (scan_plan.h).
 HELD_ADC_CLOCKS: Final = 11.5
 # A slot leaves this time for settling [us] if neither rate nor settle time is asked for, by mode
 # (scan_plan.h).
 SETTLE_US: Final = dict(zip(protocol.MODES, (20, 35, 40, 101), strict=True))
-# What the processor needs for a slot, for a reading besides, and for a scan [cycles] (scan_plan.h).
+# Time that the processor needs for each slot, in addition for each reading, and in addition for
+# each scan [cycles] (scan_plan.h).
 BUSY_A_SLOT, BUSY_A_READING, BUSY_A_SCAN = 165, 240, 5000
-# The line is fed so much slower than it could go, an eighth (scan_plan.h).
+# The line is idle for one part in so many of the time (scan_plan.h).
 LINE_IDLE_PART: Final = 8
-# Slots that are idle between scans of two kinds, and after scans of up to `FEW` readings, at least
-# (scan_plan.h).
+# At least `IDLE_TO_CHANGE` slots are idle between scans of two kinds, and at least `IDLE_OF_FEW`
+# after scans of up to `FEW` readings (scan_plan.h).
 IDLE_TO_CHANGE, FEW, IDLE_OF_FEW = 3, 3, 5
 # Rows and columns that the multiplexers have (scan_sequence.h).
 LINES_MAX: Final = 16
-# The pins change at most this time after the hold of a reading [cycles] (docs/timing.md).
+# The pins change no later than this after the hold of a reading [cycles] (docs/timing.md).
 SELECT_CYCLES: Final = 120
 
 _CONSTANTS: Final = protocol.CONSTANTS
@@ -73,7 +75,7 @@ _CONSTANTS: Final = protocol.CONSTANTS
 _PRESCALERS: Final = {name: 32 << n for name, n in protocol.ENUMS["accuracy"].values.items()}
 _REASONS: Final = protocol.ENUMS["result"].docs
 _SCAN: Final = protocol.FRAMES["scan"]
-# Settings that hello says by the same name.
+# Settings that hello says by another name; and all settings that it says.
 _ASKED: Final = {"rate_mhz": "rate_asked_mhz", "settle_us": "settle_asked_us"}
 _OF_HELLO: Final = ("unit_id", *(f.name for f in protocol.FRAMES["configure"].fields))
 
@@ -84,7 +86,7 @@ class BoardSettings:
 
     rows, columns: of the scan, and of the skin.
     mode: which readings a scan takes of each cell.
-    rate_hz: scans a second [Hz]; None: 90, or as many as readings settle in if that is less.
+    rate_hz: scans a second [Hz]; None: 90, or fewer if readings need more time to settle.
     unit_id: the skin's name.
     """
 
@@ -98,15 +100,15 @@ class BoardSettings:
 class EmulatedBoard:
     """A board whose skin reads `ratio_at(seconds, mode)`, shape (rows, columns, readings).
 
-    settings: those of the start. The skin keeps their rows and columns, whatever a host configures.
+    settings: those at the start. The skin keeps their rows and columns, whatever a host configures.
     noise_lsb: standard deviation of the converter's noise, before rounding [LSB].
     seed: of the noise.
     sampled: what the converter makes of the skin's readings; None: noise alone changes them.
     says: fields of `hello` that the board says in place of the truth.
 
     The attribute `settings` has what is set now: the fields of `configure` and `set_unit_id`. A
-    test of a host may change it, and `says`, at any time. `on_start` is called with the time [s]
-    when scans begin.
+    test may change `settings` and `says` at any time. The attribute `on_start` is called when scans
+    begin, with the time [s].
 
     :raises ValueError: a board cannot do that.
     """
@@ -136,7 +138,7 @@ class EmulatedBoard:
         self.reset("power_on")
 
     def reset(self, cause: str = "external") -> None:
-        """Do what the reset button does: scanning stops, unsaved settings are lost."""
+        """Do what the reset button does: scanning stops, and unsaved settings are lost."""
         self._decoder = framing.Decoder()
         self.settings = dict(self._stored or self._defaults)
         self._settings_source = "stored" if self._stored else "defaults_blank"
@@ -145,11 +147,11 @@ class EmulatedBoard:
         self._baud = _CONSTANTS["baud_default"]
         self._plans = self._next_plans = _scan_plans(self.settings, self._baud)
         self._sequence = 0
-        self._rate_mhz = 0  # for the answer to the command at hand
+        self._rate_mhz = 0  # what the answer to the present command says
         self._scan = 0
-        self._first = 0  # of the scans whose length is that of the one in progress
-        self._whole = False
-        self._until_whole = 0  # scans
+        self._first = 0  # number of the first scan that is as long as the one in progress
+        self._whole = False  # whether the scan in progress is a whole one
+        self._until_whole = 0  # how many scans come before the next whole one
         self._started_s: float | None = None
         self._out = bytearray()
         self._send_hello()
@@ -167,7 +169,7 @@ class EmulatedBoard:
 
     @property
     def _plan(self) -> "ScanPlan":
-        """That of the scan in progress."""
+        """The plan of the scan in progress."""
         return self._plans[self._whole]
 
     def advance(self, now_s: float) -> bytes:
@@ -180,7 +182,7 @@ class EmulatedBoard:
         return sent
 
     def heard(self, faults: LineFaults, now_s: float) -> bytes:
-        """As `advance`, at the other end of a bad line; `faults` may also reset the board."""
+        """What arrives at the other end of a line with faults; these may also reset the board."""
         if faults.resets(now_s):
             self.reset()
         return faults.apply(self.advance(now_s), now_s)
@@ -246,7 +248,10 @@ class EmulatedBoard:
         return "ok"
 
     def _configure(self, wanted: dict[str, Any]) -> str:
-        """Take what is wanted, from the next scan on; or say why not, and change nothing."""
+        """Use these settings from the next scan on. If they cannot be, nothing changes.
+
+        Returns the result, "ok" or the reason, by its name in frames.toml.
+        """
         try:
             self._next_plans = _scan_plans(wanted, self._baud)
         except _Refused as refusal:
@@ -259,14 +264,14 @@ class EmulatedBoard:
         return "ok"
 
     def _take_turn(self) -> None:
-        """Decide on the scan that begins: of the region, or a whole one in between."""
+        """Decide which scan begins now: one of the region, or a whole one."""
         before, self._plans = self._plan, self._next_plans
         every = self.settings["whole_every"]
         self._until_whole = min(self._until_whole, max(every - 1, 0))
         self._whole = every > 0 and self._until_whole == 0
         self._until_whole = every - 1 if self._whole else max(self._until_whole - 1, 0)
         if self._plan.cycles != before.cycles and self._started_s is not None:
-            # Scans of one length are counted from their first one, so that errors do not add up.
+            # Times are counted from the first scan of this length: rounding does not add up then.
             self._started_s += (self._scan - self._first) * before.cycles / CLOCK_HZ
             self._first = self._scan
 
@@ -275,7 +280,7 @@ class EmulatedBoard:
 
     def _send_self_test_report(self) -> None:
         """Say the least and the largest code of each reading, over all cells."""
-        # As the firmware says a reading that it has not taken: the least is above the largest.
+        # As the firmware marks a reading that was not taken: the least is above the largest.
         not_taken = ((1 << protocol.ADC_BITS) - 1, 0)
         bounds = dict.fromkeys(protocol.ENUMS["reading"].values, not_taken)
         for mode in ("near", self.settings["mode"]):
@@ -342,7 +347,7 @@ class EmulatedBoard:
 
 
 class _Refused(Exception):
-    """Carries the name of a `result`, and the rate that could be kept [mHz]; 0: none is known."""
+    """Carries the name of a `result`, and the rate that would be possible [mHz]; 0: not known."""
 
     def __init__(self, result: str, rate_mhz: int = 0) -> None:
         super().__init__(result)
@@ -372,11 +377,13 @@ def _defaults(settings: BoardSettings) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class ScanPlan:
-    """One kind of scan: the lines and readings of it, and its times.
+    """One kind of scan: its lines and readings, and its times.
 
-    row_mask, column_mask: the lines. mode: the readings of each cell.
-    cycles: clock cycles from its start to that of the next scan.
-    slot_cycles: clock cycles of a reading. settle_us: what these leave for settling, at least [us].
+    row_mask, column_mask: the lines that it reads.
+    mode: the readings of each cell.
+    cycles: clock cycles from its start to the start of the next scan.
+    slot_cycles: clock cycles of a slot.
+    settle_us: the least time for settling in a slot [us].
     """
 
     row_mask: int
@@ -394,7 +401,8 @@ def _rate_mhz(cycles: int) -> int:
 def _scan_plans(wanted: dict[str, Any], baud: int) -> tuple[ScanPlan, ScanPlan]:
     """How the firmware would scan: a region, and whole scans in between.
 
-    It is core/scan_plan.cpp without the search for the number of slots that keeps the rate best.
+    This is core/scan_plan.cpp, but without its search for the number of slots with which the rate
+    is kept best.
     """
     _check_limits(wanted)
     whole = {
@@ -447,7 +455,8 @@ def _scan_plan(wanted: dict[str, Any], baud: int) -> ScanPlan:
         period = round(CLOCK_HZ * 1000 / rate)
         if period < fastest:
             raise _Refused(result, 1000 * CLOCK_HZ // fastest)
-        # Equal slots fill the period: as short as the settle time lets them be, or long ones.
+        # Equal slots fill the period. With a settle time, they are as short as it allows, so that
+        # the scan is over early; else they are as long as possible, so that readings settle best.
         slots = period // slot if settle else max(least, -(-period // SLOT_CYCLES_MAX))
         slot = period // slots
     return ScanPlan(*masks, mode, period, slot, (slot - held) * 1_000_000 // CLOCK_HZ)
@@ -456,7 +465,7 @@ def _scan_plan(wanted: dict[str, Any], baud: int) -> ScanPlan:
 def _line_cycles(readings: int, baud: int) -> int:
     """Clock cycles in which the line carries a scan."""
     content = _SCAN.struct.size + protocol.codes_size(readings)
-    # As core/frame_writer.h counts: type, sequence, CRC and delimiters, and the blocks of COBS.
+    # Counted as in core/frame_writer.h: type, sequence, CRC and delimiters, and the blocks of COBS.
     octets = content + 6 + 1 + (content + 6) // (framing.MAX_BLOCK_BYTES - 1)
     cycles = octets * (CLOCK_HZ // baud * BITS_PER_BYTE)
     return cycles + cycles // (LINE_IDLE_PART - 1)

@@ -2,8 +2,8 @@
 """Runs an emulated board, behind a line with faults: in this process, or at a pseudo-terminal.
 
 A program that opens ``emulator://`` gets a `Session` over an `EmulatorLink`, in real time. With
-``speed=0`` it gets a `SteppedSkin` over a `SteppedLink`: the same, but time stands still unless
-somebody waits.
+``speed=0`` it gets a `SteppedSkin` over a `SteppedLink`, whose time passes only while somebody
+waits.
 """
 
 import math
@@ -103,16 +103,17 @@ class SteppedLink(EmulatorLink):
         return self._stepped_s
 
     def _pass(self, limit_s: float) -> None:
-        # A step that is smaller than the resolution of a float must not leave the time where it is:
-        # who waits for a time in a loop would wait for ever.
+        # Even a step that is smaller than the resolution of a float changes the time. Without this,
+        # a loop that waits for a time might never end.
         self._stepped_s = max(self._stepped_s + limit_s, math.nextafter(self._stepped_s, math.inf))
 
 
 class SteppedSkin(Session):
     """An emulated board whose time passes only while somebody waits for it: ``speed=0``.
 
-    Whoever takes a scan lets time pass until the board has sent it, which takes as long as the
-    machine needs to compute the scan. There is no thread, so every run of a program is the same.
+    A program that takes a scan lets time pass until the board has sent it. This takes as long as
+    the machine needs to compute the scan. There is no thread, so every run of a program is the
+    same.
     `host_time_s` of a scan is the time since the board was switched on.
     """
 
@@ -126,7 +127,7 @@ class SteppedSkin(Session):
         return self._stepped.now_s()
 
     def step(self, seconds: float) -> None:
-        """Let time pass. What the board sends meanwhile is received, and can be taken after that.
+        """Let time pass. What the board sends meanwhile is received, and can be taken afterwards.
 
         :raises DeviceLost: the board went away.
         """
@@ -144,16 +145,17 @@ class SteppedSkin(Session):
         return super()._wait(ready, 0.0)
 
     def _take_next(self, limit_s: float) -> None:
-        # No step is longer than that of a thread that reads, because each looks for faults.
+        # A step is no longer than a read of a thread would be, because faults are looked for once a
+        # step.
         self._take(self._stepped.read(min(limit_s, READ_TIMEOUT_S)))
 
 
 class PtyServer(_Running, Closing):
     """Serves a running board at `path`, and a scale at `scale_path`, while `serve` runs.
 
-    scale: under the skin; None: there is none, and its path is "".
+    scale: the scale under the skin; None: there is none, and `scale_path` is "".
 
-    Bytes that no program takes are thrown away, as a serial port does that nobody has open;
+    Bytes that no program takes are thrown away, as by a serial port that nobody has open.
     `lost_bytes` counts them.
 
     :raises PortError: this system has no pseudo-terminals.
@@ -199,7 +201,7 @@ class PtyServer(_Running, Closing):
                     wake_s = min(wake_s, self._scale.next_s)
                 if select.select([self._master], [], [], max(0.0, wake_s - self.now_s()))[0]:
                     self._write(self._master, self.board.heard(self._faults, self.now_s()))
-                    # More than a pseudo-terminal keeps: Linux has 4096 bytes for us.
+                    # All that has come: Linux keeps 4096 bytes, and this reads more.
                     self.board.receive(os.read(self._master, DEFAULT_BUFFER_SIZE))
 
     def _write(self, master: int, octets: bytes) -> None:
@@ -211,6 +213,6 @@ class PtyServer(_Running, Closing):
     def close(self) -> None:
         """End `serve`, and take the pseudo-terminal away. May be called again, by any thread."""
         self._closing = True
-        with self._serving:  # which ends within READ_TIMEOUT_S
+        with self._serving:  # `serve` lets it go within READ_TIMEOUT_S
             while self._files:
                 os.close(self._files.pop())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with an emulated board's line and skin, to see that a host finds it.
+"""What can be wrong with an emulated board's line and skin, to test that a host finds it.
 
 `LineFaults` change the bytes that the board sends. `SkinFaults` act in three places, in this order:
 
@@ -33,9 +33,9 @@ from ohmskin.circuit.skin import (
 )
 from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES, PER_PASS, from_scan_order, in_scan_order
 
-# An open wire, and a cell without contact, have this resistance [ohm]. Chosen: a million times that
-# of a cell at rest, so that no code shows its current; a number at all, so that the network of
-# resistors stays connected and can be solved.
+# An open wire, and a cell without contact, have this resistance [ohm]. It is not infinite, so that
+# the network of resistors stays connected and can be solved. Chosen: a million times that of a cell
+# at rest, so that no code shows its current.
 OPEN_OHM: Final = 1e12
 # A short has this conductance [S]. Chosen: 0.1 ohm, much less than a segment of wire.
 SHORT_SIEMENS: Final = 10.0
@@ -63,7 +63,7 @@ def _pair(text: str) -> Pair:
 
 
 Share = Annotated[float, _Kind(float, lambda share: 0 <= share <= 1, "a share, from 0 to 1")]
-# No skin and no line has numbers beyond these, and arithmetic with larger ones would overflow.
+# No skin and no line has numbers beyond these, with which arithmetic would overflow.
 _ABOVE_0: Final = _Kind(float, lambda n: 1e-6 <= n <= 1e9, "from 1e-6 to 1e9")
 _OR_0: Final = _Kind(float, lambda n: n == 0 or _ABOVE_0.can_be(n), "0, or from 1e-6 to 1e9")
 Amount = Annotated[float, _OR_0]
@@ -99,7 +99,10 @@ def faults_of(faults: type[FaultsT], options: Mapping[str, str], **others: Any) 
 
 @dataclass
 class LineFaults:
-    """Faults of the line by the names in `LINE_FAULTS`. seed: of all that is random here."""
+    """Faults of the line, by the names in `LINE_FAULTS`.
+
+    seed: of all that is random here.
+    """
 
     drop: Annotated[Share, "share of sent chunks that never arrive"] = 0.0
     bitflip: Annotated[Share, "share of bits that arrive inverted"] = 0.0
@@ -186,7 +189,7 @@ class SkinFaults:
                     raise ValueError(f"no {what} {line}: the skin has {what}s 0 to {count - 1}")
 
     def damaged(self, skin: Skin) -> Skin:
-        """`skin` with the faults that are other resistances than it has."""
+        """`skin` with those faults that change its resistances."""
         cell = skin.cell_siemens.copy()
         if self.dead is not None:
             cell[self.dead] = 0.0
@@ -206,17 +209,17 @@ class SkinFaults:
         return Skin(cell, top_ohm, bottom_ohm, self.ref_top, self.ref_bottom, lead_ohm)
 
     def readings(self, damaged: Skin, mode: str = "near") -> Float:
-        """Exact readings (R, C, 4) of a skin that `damaged` has made, with the faults of its ends.
+        """Exact readings (R, C, n) of a skin that `damaged` has made, with the faults of its ends.
 
-        The sense node of an open far end is connected to nothing. It keeps its charge, and so the
-        voltage of the far end that was connected to it in the cell scanned before.
+        The sense node of an open far end is connected to nothing. So it keeps its charge, and with
+        it the voltage of the far end to which it was connected in the cell that was scanned before.
         """
         rows, far = len(damaged.cell_siemens), sum(damaged.shape)
         firsts = {"rows": 0, "columns": rows, "far_rows": far, "far_columns": far + rows}
         shorts = [(n, getattr(self, f"short_{what}")) for what, n in firsts.items()]
         joints = [(n + pair[0], n + pair[1]) for n, pair in shorts if pair]
         if mode == "near" and not (joints or self.damp):
-            return readings(damaged)  # quicker: no fault of far ends is seen at near ends
+            return readings(damaged)  # is quicker; near ends show no fault of far ends
         ends = np.arange(2 * far)
         for n, pair in ((far, self.swap_far_rows), (far + rows, self.swap_far_columns)):
             if pair:
@@ -232,11 +235,12 @@ class SkinFaults:
     def sampled(
         self, ratio: Float, start_s: float, slot_s: float, settle_s: float, mode: str
     ) -> Float:
-        """What the converter reads of a scan with settled readings `ratio` (R, C, 4), same shape.
+        """What the converter reads if settled readings would be `ratio` (R, C, n), same shape.
 
-        The scan starts at start_s, with one reading a slot. In slot n a node heads for x[n], and
-        reaches v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau). The scan before this one is taken
-        to be equal. Hum adds hum_lsb sin(2 pi hum t) at the reading's own time t.
+        The scan starts at start_s, and takes one reading in each slot. In slot n, a node goes
+        towards x[n], and reaches v[n] = x[n] + (v[n-1] - x[n]) exp(-settle / tau). The scan before
+        this one is taken to have been equal. Hum adds hum_lsb sin(2 pi hum t), t the time of the
+        reading.
         """
         per_pass = PER_PASS[mode]
         read = in_scan_order(ratio, per_pass)
@@ -246,7 +250,7 @@ class SkinFaults:
             which = in_scan_order(np.broadcast_to(np.arange(len(names)), ratio.shape), per_pass)
             for k, name in enumerate(names):
                 node = next(node for node in _NODES if name in node)
-                # The drive of each slot sets the node, whichever node is read in it.
+                # In each slot, the drive sets this node as well, even if another node is read.
                 goals = [names.index(node[other in "cdgh"]) for other in names]
                 settled = _settled(in_scan_order(ratio[..., goals]), kept)
                 read = np.where(which == k, settled, read)
@@ -262,7 +266,7 @@ SKIN_FAULTS: Final = {name: text for name, (_, text) in _options(SkinFaults).ite
 def _settled(voltage: Float, kept: float) -> Float:
     """v[n] = x[n] + (v[n-1] - x[n]) kept, after a scan of the same voltages x."""
     settled = goals = voltage.tolist()
-    for _ in range(2):  # the scan before, and this one
+    for _ in range(2):  # first the scan before, then this one
         settled = list(accumulate(goals, lambda v, x: x + (v - x) * kept, initial=settled[-1]))[1:]
     return np.array(settled)
 
@@ -272,12 +276,13 @@ def joined_readings(
 ) -> Float:
     """Readings a to h, (R, C, 8), with pairs of ends joined by 0.1 ohm each.
 
-    leak_siemens: between neighbouring lines at each crossing: half of it joins their near ends, and
-    half their far ends.
+    joints: pairs of ends, by their numbers in `circuit.skin.end_admittance`.
+    ends: which end the multiplexers reach where they expect each end, by the same numbers.
+    leak_siemens: what leaks between neighbouring lines at each crossing [S]. One half of it joins
+        their near ends, and the other half their far ends.
 
-    Ends are numbered as in `circuit.skin.end_admittance`; ends: where the multiplexers find each.
     Near ends are joined in front of their leads. A joint adds its conductance to Y. Cells without
-    contact are taken for `OPEN_OHM`.
+    contact have `OPEN_OHM`.
     """
     skin = replace(skin, cell_siemens=np.maximum(skin.cell_siemens, 1 / OPEN_OHM))
     admittance = end_admittance(skin)

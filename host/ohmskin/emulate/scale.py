@@ -3,8 +3,9 @@
 
     US,GS,+  123.4 g
 
-US: it changes; ST: it is stable. It shows the force through a filter of one pole, with noise, to a
-tenth of a gram. Not modelled: drift, a zero that is not the empty skin's, an end of its range.
+US: the number changes; ST: it is stable. The scale shows the force after a filter of one pole, with
+noise, to a tenth of a gram. Not modelled: drift, a zero that is not that of the empty skin, the end
+of its range.
 """
 
 import math
@@ -15,17 +16,19 @@ import numpy as np
 
 # Standard gravity [N/g] (CGPM, 1901).
 _NEWTONS_A_GRAM: Final = 0.00980665
-# The options of an emulator:// URL: numbers a second [Hz], time constant of the filter [s], noise
-# of a number [g]. Chosen: those of a usual laboratory scale, or of an HX711 at its slower rate.
+# The options of an emulator:// URL: numbers a second [Hz], time constant of the filter [s],
+# standard deviation of a number [g]. Chosen: those of a usual laboratory scale, or of an HX711 at
+# its slower rate.
 DEFAULTS: Final = {"scale_rate": 10.0, "scale_lag": 0.1, "scale_noise": 1.0}
 SCALE_OPTIONS: Final = {
     "scale_rate": f"numbers a second, {DEFAULTS['scale_rate']:g} unless told",
     "scale_lag": f"time constant of its filter in s, {DEFAULTS['scale_lag']:g} unless told",
     "scale_noise": f"noise of a number in g, {DEFAULTS['scale_noise']:g} unless told",
 }
-# The filter takes the force so often between two numbers. Chosen: a touch is long beside it.
+# The filter samples the force so often for each number. Chosen: a touch lasts for many samples.
 _STEPS: Final = 8
-# It is stable if the number has changed by less [g]. Chosen: as scales that show 0.1 g.
+# A number is stable if it differs by less from the one before [g]. Chosen: as of scales that show
+# 0.1 g.
 _STABLE_G: Final = 1.0
 
 
@@ -55,11 +58,11 @@ class EmulatedScale:
 
     @property
     def next_s(self) -> float:
-        """See the class."""
+        """When it prints again [s]."""
         return (self._steps // _STEPS + 1) * _STEPS * self._step_s
 
     def heard(self, until_s: float) -> bytes:
-        """What it has printed since the last call, until then [s]."""
+        """What it has printed since the last call, until `until_s`."""
         lines = []
         while self._step_s * (self._steps + 1) <= until_s:
             self._steps += 1

@@ -2,13 +2,13 @@
 """Simulated skins, and what touches them, for demos and tests.
 
 A scene is a skin, whose wires and cells at rest are drawn from a seed, and touches that depend on
-time alone. So a scene always gives the same answer for the same time. It begins untouched, so that
-who tares first tares the skin at rest. In "weights" alone, touches depend on what `Scene.put` is
-told.
+time alone. So a scene always gives the same answer for the same time. Only in "weights", touches
+depend on what `Scene.put` is told. A scene begins untouched, so that a program that tares first
+tares the skin at rest.
 
 Every scene knows the forces on its cells, by the simplest law that a calibration can learn: the
-conductance that a force F adds to a cell is k F^b, with a k of each cell. It has no creep, no
-hysteresis, no drift and no noise of the contact, as textiles have (docs/force.md).
+conductance that a force F adds to a cell is k F^b, where each cell has its own k. Textiles also
+have creep, hysteresis, drift and noise of the contact (docs/force.md); a scene has none of these.
 """
 
 from dataclasses import replace
@@ -26,8 +26,8 @@ from ohmskin.emulate.faults import SkinFaults
 REST_OHM: Final = 1.0e6
 # Median of the wire segments of rows [ohm]. Chosen: in the range of a knitted skin.
 TOP_WIRE_OHM: Final = 100.0
-# Median of the wire segments of columns [ohm]. Chosen: other than that of rows, so that layers that
-# are confused show.
+# Median of the wire segments of columns [ohm]. Chosen: another than that of rows, so that a program
+# that confuses the layers is found out.
 BOTTOM_WIRE_OHM: Final = 200.0
 # The lead of each line, unless told [ohm]. Chosen: a multiplexer's switch has 70 typically (data
 # sheet of the CD74HC4067, at 4.5 V), and a connector some.
@@ -35,7 +35,7 @@ LEAD_OHM: Final = 80.0
 # Cells and segments scatter about their medians by this share: it is the standard deviation of
 # their logarithm. Chosen: no two are alike, and a cell at rest is far from a touched one.
 _SPREAD_SHARE: Final = 0.1
-# Touches begin at this time [s]. Chosen: who tares before, tares the untouched skin.
+# Touches begin at this time [s]. Chosen: it leaves time for a tare of the untouched skin.
 BEGIN_S: Final = 3.0
 # Those of the scene "corners" begin at this time [s]. Chosen: the doctor has examined the untouched
 # skin by then, behind a boot loader too, and waits for presses of corners.
@@ -43,11 +43,11 @@ _CORNERS_BEGIN_S: Final = 8.0
 # In the scene "corners", each rectangle is pressed for this time [s]. Chosen: long enough for
 # several of the doctor's looks of 0.3 s.
 _CORNERS_HELD_S: Final = 1.5
-# Its three touches: resistance [ohm], and how often in a second it trembles, as a finger does [Hz].
-# Chosen so that no two tremble together.
+# The three touches of "corners": resistance [ohm], and how often it trembles in a second, as a
+# finger does [Hz]. Chosen: no two of them tremble together.
 _CORNERS_OHM_HZ: Final = ((5e3, 3.1), (8e3, 4.7), (6e3, 6.1))
 # Conductances of these touches tremble by this share to either side. Chosen: enough to tell the
-# three apart, and no touch ends by it.
+# three apart, and not enough to end a touch.
 _TREMBLE_SHARE: Final = 0.05
 # In the scene "moving", a finger goes round in this time [s]. Chosen: an eye can follow it.
 _MOVING_PERIOD_S: Final = 4.0
@@ -59,13 +59,13 @@ _FINGER_SIEMENS: Final = 2e-4
 
 # In the scene "slip", a fingertip presses with this force [N], as one that holds a cup.
 _SLIP_N: Final = 4.0
-# Its force trembles so often in a second, and by this share to either side. Chosen: as where a
+# Its force trembles so often in a second [Hz], and by this share to either side. Chosen: as when a
 # thing begins to slip.
 SLIP_HZ: Final = 200.0
 SLIP_SHARE: Final = 0.05
 
-# A force of 1 N adds this conductance to a usual cell [S]. Chosen: as in the studies' model of
-# textile contact (studies/press.py).
+# A force of 1 N adds this conductance to a usual cell [S]. Chosen: as in the model of textile
+# contact that the studies use (studies/press.py).
 _SIEMENS_AT_1N: Final = 30e-6
 # The conductance grows with this power of the force. Chosen: as in that model.
 _EXPONENT: Final = 1.7
@@ -94,7 +94,7 @@ _TIP_MOVES_CELLS: Final = 1.5
 # After so many fingertips for each cell, they come again. Chosen: four minutes on 8x8.
 _TIPS_A_CELL: Final = 4
 
-# When touches begin, where it is not at `BEGIN_S` [s].
+# When touches begin in scenes where it is not at `BEGIN_S` [s].
 _BEGIN_S: Final = {
     "rest": float("inf"),
     "corners": _CORNERS_BEGIN_S,
@@ -129,11 +129,11 @@ class Scene:
     Conductance of a cell: g(t) = 1 / r_rest + touch(t), touch = k F(t)^b [S], all (rows, columns).
 
     seed: of the wires and cells at rest, and of the touches of "multi".
-    faults: what is wrong with the skin; a fault that differs from reading to reading, such as hum,
-    is not in `ratio`: `EmulatedBoard` adds it.
+    faults: what is wrong with the skin. A fault that differs from reading to reading, such as hum,
+        is not in `ratio`: `EmulatedBoard` adds it.
     begin_s: when touches begin [s]; None: as `SCENES` says.
 
-    `rest` is the untouched skin, without faults: another of the same size may take its place.
+    `rest` is the untouched skin, without faults; it may be replaced by another of the same size.
     `moves`: whether touches change after they have begun.
 
     :raises ValueError: no such scene or time, or a skin too small for the scene or the faults.
@@ -171,13 +171,13 @@ class Scene:
         layers = 1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM)
         self.rest = Skin(*layers, lead_ohm=np.array(LEAD_OHM))
         self._touches = self._place(random)
-        # Of other generators, so that a scene has the same skin and touches whatever else is drawn.
+        # From another generator, so that all that is drawn above stays as it is.
         log_gain = _GAIN_SPREAD * np.random.default_rng([seed, 1]).standard_normal((rows, columns))
         self._siemens_at_1n = _SIEMENS_AT_1N * np.exp(log_gain)
         cells = rows * columns
         self._robot = _Presses(ROBOT_PRESSES * cells, _ROBOT_PEAK_N, [seed, 2])
         self._tips = _Presses(_TIPS_A_CELL * cells, _TIP_N, [seed, 3])
-        # Cell after cell in an order without order, so that none waits for long.
+        # All cells in a random order, again and again, so that no cell waits for long.
         order = np.random.default_rng([seed, 4])
         self._tip_cells = np.concatenate([order.permutation(cells) for _ in range(_TIPS_A_CELL)])
         self._tip_ways = order.uniform(0, 2 * np.pi, self._tip_cells.size)
@@ -196,7 +196,7 @@ class Scene:
         return self.faults.damaged(touched)
 
     def wait(self, start_s: float) -> None:
-        """Scans begin at this time: fingertips that knead wait until then, as people do."""
+        """Take this for the time when scans begin: only then do the fingertips of "knead" begin."""
         if self.name == "knead":
             self.begin_s = start_s + self._waits_s
 
@@ -270,7 +270,7 @@ class Scene:
         return touches
 
     def _three_corners(self, across: int) -> list[tuple[int, int]]:
-        """Corners of a rectangle: of the first and the fourth, only the fourth if across is 1."""
+        """Three corners of a rectangle: the fourth in place of the first if `across` is 1."""
         (top, bottom), (left, right) = _two_of(self.rows), _two_of(self.columns)
         return [(bottom, right) if across else (top, left), (top, right), (bottom, left)]
 
@@ -282,7 +282,7 @@ class Scene:
         return touches
 
     def _fingertip(self, knead_s: float) -> Float:
-        """Forces (rows, columns) [N], so long after the fingertips have begun."""
+        """Forces (rows, columns) [N] at a time since the fingertips have begun."""
         number, share, force_n = self._tips.at(knead_s % self._tips.end_s)
         row, column = np.divmod(self._tip_cells[number], self.columns)
         moved, way = _TIP_MOVES_CELLS * (share - 0.5), self._tip_ways[number]
@@ -311,7 +311,7 @@ class Scene:
 class _Presses:
     """So many presses, one after another, whose peaks are drawn between two forces [N].
 
-    end_s: when the last one is over, after the first may begin [s].
+    end_s: how long all of them take [s].
     """
 
     def __init__(self, count: int, peaks_n: tuple[float, float], seed: list[int]) -> None:

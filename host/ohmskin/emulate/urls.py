@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a URL to a board without hardware: ``emulator://8x8?scene=ghost`` and ``simavr://uno``.
 
-docs/commands.md lists the options. They are those of the board and of what touches its skin, named
-here, and those of faults, which `faults` defines.
+docs/commands.md lists the options. Those of the board, and of what touches its skin, are named
+here; those of faults are defined in `faults`.
 """
 
 import re
@@ -52,20 +52,22 @@ def open_simavr(text: str) -> Session:
     :raises PortError: the URL is wrong, or the simulator or the firmware is not built.
     """
     url = PortUrl.of(text)
-    settings, baud = dict(url.options), url.baud  # read first: a simulator would have to be ended
+    # The speed is read first: if it is wrong, no simulator has to be ended.
+    settings, baud = dict(url.options), url.baud
     with url.blamed():
         scene = _scene(url, f"{settings.pop('rows', 8)}x{settings.pop('columns', 8)}")
         for name in (*_OF_SCENE, "baud"):
             settings.pop(name, None)
         link = SimavrLink(url.place, scene, text, settings)
         skin = Session(link, baud)
-        # A board behind a boot loader has just begun to count, and said hello at once.
+        # A board with a boot loader is reset when its port is opened. So it has just begun to count
+        # time, and has said hello at once.
         boot_s = link.now_s if link.resets_board else 0.0
         return _in_scene(skin, scene, lambda board_s: link.scene_s(boot_s + board_s))
 
 
 def _in_scene(skin: Session, scene: Scene, scene_s: Callable[[float], float]) -> Session:
-    """The skin, which knows the forces of its scene.
+    """The skin, which now knows the true forces of its scene.
 
     scene_s: the scene's time [s] at a time of the board's clock [s].
     """
