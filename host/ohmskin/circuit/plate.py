@@ -17,10 +17,10 @@ from ohmskin.link.protocol import CONSTANTS
 
 # Largest file that is read. Chosen: 32 x 32 numbers are 20 kB, so a larger file is no plate.
 MAX_FILE_BYTES: Final = 100_000
-# Least resistor of a plate. Chosen: beside references of 30 kOhm, it differs from a short by less
-# than a code of 10 bits. So a lower number is in another unit.
+# Least resistor of a plate [ohm]. A lower number is taken for one in another unit. Chosen: beside
+# references of 30 kOhm, it differs from a short by less than a code of 10 bits.
 LEAST_OHM: Final = 100.0
-# Highest resistor of a plate. Chosen: it differs from an open crossing by one code.
+# Largest resistor of a plate [ohm]. Chosen: it differs from an open crossing by one code.
 MOST_OHM: Final = 30e6
 
 

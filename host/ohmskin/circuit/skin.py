@@ -6,13 +6,13 @@ Symbols
 ====== ============ ==================================================================== =========
 symbol shape        meaning                                                              unit
 ====== ============ ==================================================================== =========
-R, C                number of rows (stripes of the top layer) and of columns (bottom layer)
+R, C                number of rows (stripes of the top layer) and columns (bottom layer)
 g      (R, C)       cell conductance, joins top node T[i,j] and bottom node B[i,j]       S
 Rt     (R, C)       top wire segment that ends at T[i,j], from T[i,j-1] or the electrode  ohm
 Rb     (R, C)       bottom segment that ends at B[i,j], from B[i-1,j] or the electrode    ohm
 Rl     (R+C,)       lead of a line: between the multiplexer's common pin and electrode    ohm
-K      (RC, RC)     voltage lost in the wires to cell e per current of cell f            ohm
-E      (R+C, RC)    incidence: +1 at a cell's row electrode, -1 at its column electrode
+K      (RC, RC)     voltage lost in the wires up to cell e per current through cell f    ohm
+E      (R+C, RC)    incidence: +1 at a cell's row electrode, -1 at its column electrode  1
 Y      (R+C, R+C)   admittance of the skin seen from its electrodes                      S
 Z      (R+C, R+C)   inverse of Y, one electrode of each connected part grounded          ohm
 rho    (R, C)       port resistance between row electrode i and column electrode j       ohm
@@ -30,10 +30,10 @@ Equations. With x the cell currents and V the electrode potentials,
 A lead (switch of the multiplexer, crimp, margin of yarn) carries the whole current of a port, and
 none while another line is selected. So it adds to the port's resistance, as a reference does.
 
-This is Kirchhoff's law on the network of 2RC nodes, with the nodes of wires eliminated: along a
-line, cells j and k share the wire up to the nearer of them, so K is a sum of segments. What is
-factorised is 1 + sqrt(g) K sqrt(g), because that needs no special value for open cells (g = 0) and
-for wires of zero ohm.
+These are Kirchhoff's laws on the network of 2RC nodes, from which the nodes along the wires have
+been eliminated. Two cells of a line share the wire up to the nearer of them, so each element of K
+is a sum of segments. The matrix that is factorised is 1 + sqrt(g) K sqrt(g), because it needs no
+special value for open cells (g = 0), nor for wires of 0 ohm.
 """
 
 from collections.abc import Iterable, Sequence
@@ -54,19 +54,19 @@ Wire = float | Float
 NEAR: Final = MODES["near"]
 CONFIGURATIONS: Final = tuple(name.upper() for name in NEAR)
 READINGS_PER_CELL: Final = len(NEAR)
-# Configurations A to D read y = offset + sign * R * I, R the reference resistor that they sense.
+# Configurations A to D read y = offset + sign * R_ref * I, R_ref the resistor that they sense.
 READING_OFFSET: Final[Float] = np.array([1.0, 0.0, 1.0, 0.0])
 READING_SIGN: Final[Float] = np.array([-1.0, 1.0, -1.0, 1.0])
 READING_SENSES_TOP: Final[Bool] = np.array([True, False, False, True])
 
-# A node's reading with the top pin high, and that with the bottom pin high: the near ends of row
-# and column, then their far ends.
+# A node's reading with the top pin high, and its reading with the bottom pin high: near end of the
+# row, near end of the column, far end of the row, far end of the column.
 EXCHANGED: Final = {"a": "d", "b": "c", "e": "h", "f": "g"}
 
-# A reference resistor, if nothing else is told: that of the wiring in README.md.
+# A reference resistor, unless told [ohm]: that of the wiring in README.md.
 DEFAULT_REF_OHM: Final = 30_000.0
-# No reference, wire or lead has more. Chosen: a gigohm, which no converter sees; squares of what
-# follows from it stay finite.
+# No reference, wire or lead has more [ohm]. Chosen: a gigohm. No converter sees a current through
+# it, and squares of what is computed with it stay finite.
 MAX_OHM: Final = 1e9
 
 
@@ -76,11 +76,12 @@ class Skin:
 
     cell_siemens: conductance of each cell (R, C) [S]; 0 is an open cell.
     top_wire_ohm: segments of the top layer (R, C) [ohm]; [i, j] ends at T[i, j], and [i, 0] comes
-        from the electrode of row i. Zeros are exact.
+        from the electrode of row i. 0 is a wire without resistance.
     bottom_wire_ohm: segments of the bottom layer (R, C) [ohm]; [i, j] ends at B[i, j], and [0, j]
         comes from the electrode of column j.
     ref_top_ohm, ref_bottom_ohm: reference resistors [ohm].
-    lead_ohm: leads of the rows, then of the columns (R+C,) [ohm]; given as (), all are alike.
+    lead_ohm: leads of the rows, then of the columns (R+C,) [ohm]; if it is given as one number, all
+        have it.
 
     Raises ValueError for other shapes, values that are negative or not finite, references not > 0.
     """
@@ -139,7 +140,7 @@ _triangle = lru_cache(maxsize=8)(np.tri)
 
 @lru_cache(maxsize=8)
 def _unit_coupling(rows: int, columns: int) -> tuple[Float, Float]:
-    """K of top wires, and of bottom wires, of 1 ohm a segment."""
+    """K of a skin with 1 ohm in each top segment alone, and in each bottom segment alone."""
     shape = rows, columns
     ones, zeros = np.ones(shape), np.zeros(shape)
     return wire_coupling_ohm(ones, zeros, shape), wire_coupling_ohm(zeros, ones, shape)
@@ -163,8 +164,10 @@ def factorised(
 ) -> tuple[Float, Float]:
     """L of L L^T = 1 + sqrt(g) K sqrt(g), (RC, RC), and "half", L^-1 sqrt(g) [E^T F].
 
-    root: sqrt(g), (R, C). to_sense: F (RC, R+C); None: near ends are sensed, and half has no part
-    of F. The part of E^T gives Y = half^T half.
+    With the columns of "half" that belong to E^T, Y is half^T half.
+
+    root: sqrt(g), (R, C).
+    to_sense: F (RC, R+C); None: near ends are sensed, and "half" has no columns of F.
     """
     system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm, root.shape)
     system *= root.reshape(-1, 1)
@@ -177,8 +180,10 @@ def factorised(
 
 
 def admittance_of(half: Float) -> Float:
-    """Y = half^T half. No current leaves the skin, so the sum of each row is zero. A diagonal that
-    is made so keeps small conductances, which rounding of the large ones would drown.
+    """Y = half^T half, (R+C, R+C) [S].
+
+    No current leaves the skin, so the sum of each row is 0. The diagonal is computed from this, and
+    not from the product: so small conductances are not lost in the rounding of large ones.
     """
     admittance: Float = half.T @ half
     diagonal = np.einsum("ii->i", admittance)
@@ -191,7 +196,7 @@ def admittance_of(half: Float) -> Float:
 def port_resistance_ohm(skin: Skin) -> Float:
     """rho[i,j] = Z[i,i] + Z[j,j] - 2 Z[i,j] [ohm], shape (R, C), all other electrodes floating.
 
-    A port that no chain of cells connects (all of them open) is inf.
+    It is inf for a port whose row and column no chain of conducting cells connects.
     """
     rows, root = skin.shape[0], np.sqrt(skin.cell_siemens)
     half = factorised(root, skin.top_wire_ohm, skin.bottom_wire_ohm)[1]
@@ -207,9 +212,10 @@ def impedance_of(
     """Z (R+C, R+C) and rho (R, C) of Y, which is overwritten.
 
     part: the number of the connected part that each electrode is in; None: all are connected.
-    Y is singular, as potentials have no zero, so one electrode of each part is grounded, by a
-    conductance as large as its own. Which one changes no resistance within the part. The best
-    connected one costs the least precision.
+
+    Y is singular, because potentials have no zero. So one electrode of each part is grounded, by a
+    conductance as large as its own element of the diagonal. Whichever it is, resistances within the
+    part are the same. The best connected electrode is taken, which costs the least precision.
     """
     diagonal = admittance.diagonal()
     grounds = [diagonal.argmax()]
@@ -245,8 +251,9 @@ def _unit_path(rows: int, columns: int) -> Float:
 def leak_admittance(shape: tuple[int, int], leak_siemens: tuple[float, float]) -> Float:
     """What leaks between neighbouring lines of a layer add to Y, (R+C, R+C) [S].
 
-    leak_siemens: of rows and of columns, at each crossing. It is as if they joined the electrodes,
-    because they resist a thousand times as much as the wires up to them.
+    leak_siemens: leaks of rows and of columns, at each crossing [S]. They are taken to join the
+        electrodes of the lines, because they resist a thousand times as much as the wires up to
+        them.
     """
     rows, columns = shape
     leaks = np.zeros((rows + columns, rows + columns))
@@ -263,9 +270,10 @@ def leak_admittance(shape: tuple[int, int], leak_siemens: tuple[float, float]) -
 def end_admittance(skin: Skin) -> Float:
     """Y [S] of both ends of all lines, (2(R+C), 2(R+C)): near ends, rows first, then far ends.
 
-    A near end is in front of the line's lead, which therefore adds to the first segment. A far end
-    is behind 1 ohm, for its multiplexer, at T[i, C-1] or B[R-1, j]. So it is computed as one more
-    cell of its line, at the end of the line's wire, to an electrode of its own.
+    A near end is in front of the line's lead, so the lead is added to the first segment. A far end
+    is joined to T[i, C-1] or B[R-1, j] by 1 ohm, which stands for its multiplexer. So it is
+    computed as one more cell of its line, at the end of the line's wire, that leads to an electrode
+    of its own.
     """
     rows, columns = skin.shape
     cells, lines = rows * columns, rows + columns
@@ -283,15 +291,15 @@ def end_admittance(skin: Skin) -> Float:
 
 
 def port_difference(lines: Float, rows: int) -> Float:
-    """For each port, what its row has less what its column has: (RC, n), of lines (R+C, n)."""
+    """For each port, the values of its row less those of its column: (RC, n), from (R+C, n)."""
     return (lines[:rows, None] - lines[None, rows:]).reshape(-1, lines.shape[1])
 
 
 def wire_current(cell_current: Float) -> Float:
     """Currents through all wires, (n, 2, R, C), from those through the cells (n, R, C).
 
-    A wire segment carries what the cells behind it draw. These sums are made as products with a
-    triangle of ones, which is faster.
+    A wire segment carries the sum of the currents of all cells behind it. These sums are computed
+    as products with a triangle of ones, which is faster than adding up.
     """
     _, rows, columns = cell_current.shape
     current = np.empty((len(cell_current), 2, rows, columns))
@@ -314,20 +322,22 @@ class PortCircuit:
     impedance: potentials of electrodes per current into each electrode, (R+C, R+C) [ohm].
     sensed: potentials of electrodes per current into each sensed end, (R+C, R+C) [ohm].
     factor: L of `factorised` (RC, RC).
-    port_ohm: voltage between the sensed ends per current through the port (RC,) [ohm]: rho, or at
-        far ends that without the wires up to them.
-    drop_ohm: what the wires of row and of column lose up to the sensed ends, per current of the
-        port (2, RC) [ohm]; 0 for lines that are sensed at near ends. It exists if any is not.
+    port_ohm: voltage between the sensed ends per current through the port (RC,) [ohm]. At near ends
+        this is rho; at far ends it is rho less what the wires up to them lose.
+    drop_ohm: voltage that the wire of the row, and that of the column, lose up to the sensed end,
+        per current of the port (2, RC) [ohm]; 0 for lines that are sensed at near ends. Only a
+        circuit that senses far ends has this attribute.
 
-    **Slopes.** d port_ohm / d log r_e = r_e i_e j_e [ohm], by Tellegen's theorem: i_e is the
-    current through resistance e while the port is driven with a current of one, j_e that if this
-    current flowed into the sensed ends. So the currents that give port_ohm give all its RC x 3RC
-    slopes. A port's currents are those of its row less those of its column: R+C solutions are
-    enough.
+    **Slopes.** d port_ohm / d log r_e = r_e i_e j_e [ohm], by Tellegen's theorem. i_e is the
+    current through resistance e while a current of one flows through the driven ends of the port,
+    and j_e is the same if it flowed through the sensed ends. So the currents that give port_ohm
+    also give all its RC x 3RC slopes. A port's currents are those of its row less those of its
+    column: so R+C solutions are enough.
 
-    **Far ends.** A current into the far end of a line flows through all of the line's wire. It adds
-    a voltage to the path of each cell of this line: by the wire that both share, F. By reciprocity,
-    the sensed ends have the potentials (Z (1 - Q))^T per current into the near ends.
+    **Far ends.** A current into the far end of a line flows through all of the line's wire. Each
+    cell of the line shares a part of this wire, so a voltage is added in the path to this cell: F
+    per current. By reciprocity, the sensed ends have the potentials (Z (1 - Q))^T per current into
+    the near ends.
     """
 
     def __init__(
@@ -363,8 +373,9 @@ class PortCircuit:
 
     @cached_property
     def _currents(self) -> Float:
-        """Currents through all cells (RC, ...) per potential of each electrode, and those that F
-        drives, if far ends are sensed.
+        """Currents through all cells per potential of each electrode, (RC, R+C).
+
+        If far ends are sensed, R+C columns follow: the currents that F drives.
         """
         currents = solve_lower(self.factor, self._half, transposed=True)
         currents *= self._root.reshape(-1, 1)
@@ -409,8 +420,9 @@ class PortCircuit:
         return current
 
     def line_current(self, layer: int) -> Float:
-        """Currents through the segments of a port's row (layer 0), or of its column (layer 1), per
-        current of the port: (lines, ports of the line, segments).
+        """Currents through the segments of a line, per current through each port of this line.
+
+        (lines, ports of the line, segments); layer 0: lines are rows; layer 1: columns.
         """
         rows, current = self.rows, self._wire_current[:, layer]
         if layer == 0:
@@ -430,20 +442,20 @@ class PortCircuit:
         return slopes
 
     def by_cell(self) -> Float:
-        """Slopes by the cells, (RC, RC)."""
+        """Slopes by the log resistance of each cell, (RC, RC) [ohm]."""
         return self._slopes(self.cell_current, self.sense_current, self._root**-2.0)
 
     def by_wires(self) -> Float:
-        """Slopes by the wire segments, (RC, 2RC): top ones, then bottom ones."""
+        """Slopes by the log of each wire segment, (RC, 2RC) [ohm]: top segments come first."""
         ohm = np.empty((2, *self.shape))
         ohm[0], ohm[1] = self.wire_ohm
         return self._slopes(self._wire_current, self._wire_sense_current, ohm)
 
     def by_layers(self) -> Float:
-        """Slopes by the log of each layer, all segments together, (RC, 2).
+        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm].
 
-        They are the sums of `by_wires` over each layer. A product of the currents of lines makes
-        them without the slopes by all segments, which takes less time.
+        They are the sums of `by_wires` over each layer. Here a product of the currents of lines
+        gives them without the slopes by single segments, which takes less time.
         """
         slopes, lines = [], len(self.impedance)
         for layer, ohm in enumerate(self.wire_ohm):
@@ -464,8 +476,11 @@ class PortCircuit:
 def leak_slopes(volt: Float, sensed: Float, shape: tuple[int, int]) -> Float:
     """d port_ohm / d leak of rows, and of columns, at each crossing, (n, 2) [ohm / S].
 
-    volt, sensed: potentials of electrodes (n, R+C) per current of n ports into their driven, and
-    into their sensed ends [ohm]. As for one conductance, d port_ohm / d g = -v v'.
+    For a single conductance, d port_ohm / d g = -v v', v and v' the voltages over it. A leak is one
+    conductance between each two neighbouring lines at each crossing, so the products are summed.
+
+    volt, sensed: potentials of electrodes (n, R+C), per current through the driven ends, and
+        through the sensed ends, of n ports [ohm].
     """
     rows, columns = shape
     return np.stack(
@@ -478,10 +493,10 @@ def leak_slopes(volt: Float, sensed: Float, shape: tuple[int, int]) -> Float:
 
 
 def _ends_of_ports(lines: Float, rows: int) -> Float:
-    """What a port's current makes at its row and at its column, (2, R, C).
+    """What the current of each port causes at its row and at its column, (2, R, C).
 
-    lines[i, j] (R+C, R+C): what a current into line j makes at line i, or the other way round. The
-    current of a port flows into its row and out of its column.
+    lines[i, j] (R+C, R+C): what a current into line j causes at line i; or transposed. The current
+        of a port flows into its row and out of its column.
     """
     at_itself, by_row, by_column = lines.diagonal(), lines[:rows, rows:], lines[rows:, :rows]
     return np.stack([at_itself[:rows, None] - by_column.T, by_row - at_itself[rows:]])
@@ -520,8 +535,8 @@ def ratio_from_current(
 def node_ratio(ratio: Float, reading_names: Sequence[str], node: str) -> Float:
     """Potential over Vdd of the node of reading a, b, e or f while the top pin is high, (...).
 
-    It is the mean of the readings (..., n), of these names, that are taken at this node. A reading
-    with the supplies exchanged is 1 less the potential. Raises ValueError if there is none.
+    It is the mean of those of the readings (..., n), of these names, that are taken at this node. A
+    reading with exchanged supplies is 1 minus the potential. Raises ValueError if there is none.
     """
     high = [ratio[..., k] for k, name in enumerate(reading_names) if name == node]
     low = [1 - ratio[..., k] for k, name in enumerate(reading_names) if name == EXCHANGED[node]]
@@ -538,7 +553,7 @@ def is_near(reading_names: Iterable[str]) -> bool:
 
 
 def as_near(ratio: Float, reading_names: Sequence[str]) -> Float:
-    """Readings a to d (..., 4), of some of both ends; of near ends alone they stay as they are."""
+    """Readings a to d (..., 4), made of readings at both ends. Those of near ends alone stay."""
     if is_near(reading_names):
         return ratio
     a, b = (node_ratio(ratio, reading_names, node) for node in "ab")
@@ -548,8 +563,9 @@ def as_near(ratio: Float, reading_names: Sequence[str]) -> Float:
 def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) -> Float:
     """I = sum_k R_k s_k (y_k - offset_k) / sum_k R_k^2, per Vdd [S], shape (...,) from (..., 4).
 
-    Each reading alone gives I_k = s_k (y_k - offset_k) / R_k. Weights R_k^2 give the mean of least
-    variance, if all readings are equally noisy.
+    Each reading alone gives I_k = s_k (y_k - offset_k) / R_k, with s_k its `READING_SIGN` and R_k
+    the reference that it senses. If all readings are equally noisy, the mean with the weights R_k^2
+    has the least variance.
     """
     reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
     weight = READING_SIGN * reference / (reference @ reference)
@@ -559,8 +575,8 @@ def current_from_ratio(ratio: Float, ref_top_ohm: float, ref_bottom_ohm: float) 
 def current_std(ratio_std: float, ref_top_ohm: float, ref_bottom_ohm: float) -> float:
     """Standard deviation of `current_from_ratio` [S]: ratio_std * sum_k R_k / sum_k R_k^2.
 
-    Deviations add up, and not variances, because without other noise all four readings round alike.
-    For independent noise, this is too large by 2 at most.
+    Deviations are added, and not variances, because without other noise all four readings are
+    rounded alike. For independent noise, the result is too large by a factor of at most 2.
     """
     reference = reference_ohm(ref_top_ohm, ref_bottom_ohm)
     return float(ratio_std * np.sum(reference) / np.sum(reference**2))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Matrices as small as a skin's, solved fast: LAPACK directly, and one BLAS thread.
 
-What scipy.linalg checks before it calls LAPACK takes as long again, and more threads are slower.
-Symmetric matrices and factors are lower triangles, in Fortran's order; what is above is anything.
+The checks of scipy.linalg take as long as LAPACK itself, and more threads are slower than one. Of
+symmetric matrices and of factors, only the lower triangle counts, in Fortran's order; above it,
+there may be anything.
 """
 
 import threading
@@ -17,20 +18,20 @@ from ohmskin.arrays import Float
 
 
 def gram(rows: Float, onto: Float | None = None) -> Float:
-    """rows rows^T, added onto a matrix that is overwritten, if there is one."""
+    """rows rows^T. It is added to the matrix `onto`, if there is one, which is overwritten."""
     turned = rows.T  # C's order is Fortran's of the transpose: nothing is copied
     beta = 0.0 if onto is None else 1.0
     return np.asarray(blas.dsyrk(1.0, turned, beta, onto, trans=1, lower=1, overwrite_c=1))
 
 
 def cholesky(system: Float) -> Float:
-    """L of a positive definite matrix L L^T.
+    """L of a positive definite matrix L L^T. A matrix in C's order must be symmetric.
 
-    One that rounding has made indefinite gets the least share of its largest diagonal element, from
-    1e-14, that mends it. A C-ordered matrix must be symmetric: it is its own transpose, in
-    Fortran's order.
-    Raises LinAlgError if a millionth does not.
+    Rounding may have made the matrix indefinite. Then a share of its largest diagonal element is
+    added to its diagonal: 1e-14, or 100 times as much again and again, until this mends it. Raises
+    LinAlgError if a millionth does not.
     """
+    # In C's order, a matrix is its own transpose in Fortran's order: nothing is copied.
     lower = system if system.flags.f_contiguous else system.T
     factor, failed = lapack.dpotrf(lower, lower=1, clean=0)
     share = 1e-14
@@ -51,11 +52,11 @@ def solve(factor: Float, right: Float) -> Float:
 
 
 def solve_positive(system: Float, right: Float) -> Float:
-    """x of system x = right, for a system that nothing else is solved with: faster than both above.
+    """x of system x = right. It is faster than `cholesky` and `solve`, where L is not needed again.
 
-    One that rounding has made indefinite is mended as in `cholesky`, with the same error.
+    A system that rounding has made indefinite is mended as in `cholesky`, with the same error.
     """
-    if not len(system):  # LAPACK takes no empty one
+    if not len(system):  # LAPACK takes no empty system
         return np.zeros_like(right)
     _, solution, failed = lapack.dposv(system, right, lower=1)
     return solve(cholesky(system), right) if failed else np.asarray(solution)
@@ -83,16 +84,16 @@ def solve_lower(factor: Float, right: Float, *, transposed: bool = False) -> Flo
 
 
 def _check(failed: int) -> None:
-    """Raise LinAlgError for LAPACK's code of failure: what it returns with it is no solution."""
+    """Raise LinAlgError if LAPACK's code says that it failed: then it has returned no solution."""
     if failed:
         raise np.linalg.LinAlgError("matrix is not positive definite")
 
 
 class _OneBlasThread(ContextDecorator):
-    """A context manager, or decorator, that any number of threads may be in at once.
+    """Limits BLAS to one thread: a context manager or decorator.
 
-    The limit is the process's: the first thread that comes in sets it, and the last one that leaves
-    restores what was there before.
+    Any number of threads may be inside at once. The limit is that of the process: the first thread
+    that enters sets it, and the last one that leaves restores what was there before.
     """
 
     def __init__(self) -> None:
@@ -105,7 +106,7 @@ class _OneBlasThread(ContextDecorator):
         with self._lock:
             if not self._inside:
                 if self._libraries is None:
-                    # Looking through all loaded libraries takes milliseconds: so only once.
+                    # Only once, because looking through all loaded libraries takes milliseconds.
                     libraries = ThreadpoolController().lib_controllers
                     self._libraries = [one for one in libraries if one.user_api == "blas"]
                 numbers = ((library, library.num_threads) for library in self._libraries)
@@ -123,7 +124,8 @@ class _OneBlasThread(ContextDecorator):
 def _set_threads(numbers: list[tuple[Any, int]]) -> None:
     for library, number in numbers:
         library.set_num_threads(number)
-        # Since 3.8 threadpoolctl lets one thread alone set limits, until that gives the right back.
+        # Since version 3.8, threadpoolctl lets only one thread set limits until this thread gives
+        # the right back.
         if hasattr(library, "clear_controlling_thread"):
             library.clear_controlling_thread()
 
