@@ -56,7 +56,8 @@ from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recording, Tare, load_recording
 
-# Rest is measured so long [s] after somebody is asked to let go. Chosen: long enough to let go.
+# After a person is asked to let go, so much time passes before rest is measured [s]. Chosen: long
+# enough to let go.
 COUNT_DOWN_S: Final = 3
 
 Out = Annotated[Path, Argument(help="calibration file to write (.json)")]
@@ -289,7 +290,7 @@ def _learn_totals(calibrator_of: _CalibratorOf, given: Recording, out: Path) -> 
 
 
 def _log_in(given: Recording, *, any_zero: bool = False) -> ForceLog:
-    """The forces in a recording; the scans have the same clock."""
+    """The forces in a recording, whose times are by the same clock as those of the scans."""
     samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
     time_s, force_n = samples.T
     if not {sample.source for sample in given.forces} & {WEIGHTS, TRUTH}:
@@ -302,7 +303,7 @@ def _knead(
 ) -> None:
     """Learn from the total force, write the calibration, and say what came of it.
 
-    log: by another clock; None: the forces in the recording.
+    log: forces whose times are by another clock; None: the forces in the recording are taken.
     """
     kneading, offset_s = Kneading(calibrator, given.scans), 0.0
     if log is None:
@@ -397,7 +398,8 @@ def _options(
 ) -> _CalibratorOf:
     """Check the options that all commands have, before anybody presses cells for an hour.
 
-    force: the rest counts even if cells seem touched. table: whether presses are in a table.
+    force: the rest counts even if cells seem touched.
+    table: whether presses are in a table.
     Returns a function that makes the calibrator.
     """
     if method not in LEVEL_METHODS:
@@ -412,7 +414,7 @@ def _options(
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:
-    """Mean readings (R, C, 4) of so many first seconds; 0: the recorded tare."""
+    """Mean readings (R, C, 4) of the first `rest_s` seconds; 0: those of the recorded tare."""
     if rest_s:
         first_s = given.scans[0].host_time_s
         untouched = [scan for scan in given.scans if scan.host_time_s - first_s <= rest_s]
@@ -431,7 +433,8 @@ def _finish(
 ) -> None:
     """Write the calibration that is learned from presses, and say how good it is.
 
-    source: where the presses are from. note: is printed first.
+    source: where the presses are from.
+    note: is printed first.
     """
     with naming(source):
         calibration, message = calibrator.calibration(presses)

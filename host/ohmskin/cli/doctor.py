@@ -86,7 +86,7 @@ def doctor(
 def _keep_wires(diagnosis: Diagnosis, told: WireOhm, into: Path) -> None:
     """Write the wires that presses or far ends showed into a calibration, with their deviation.
 
-    told: its leads are kept where only far ends would have shown them.
+    told: the wires that were told. Their leads are kept where only far ends could have shown leads.
     """
     wires = measured_wires(diagnosis)
     if wires is None:

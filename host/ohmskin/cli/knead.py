@@ -27,7 +27,8 @@ from ohmskin.record.force_sensor import ForceSensor
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recording, load_recording
 
-# Where nobody sees the map, a line says so often how far it is [s]. Chosen: some a minute.
+# Where no terminal shows the map, a line says how much is known, once in this time [s]. Chosen:
+# some lines a minute.
 _SAY_EVERY_S: Final = 10.0
 
 
@@ -39,7 +40,10 @@ class KneadMap:
         self._said_s = self._began_s = recorder.now_s()
 
     def look(self, scan: Scan) -> None:
-        """At a scan that was recorded."""
+        """Look at a scan that was recorded. Without a terminal, say now and then what is known.
+
+        :raises TareRefused: the force moved during the tare.
+        """
         self._coverage.look(scan, self._recorder.tare, self._recorder.force)
         moved_n = self._coverage.moved_n
         if self._recorder.tare is not None and moved_n > LEAST_N:
@@ -50,7 +54,7 @@ class KneadMap:
             TERMINAL.print(f"{scan.host_time_s - self._began_s:.0f} s: {self.words()}")
 
     def words(self) -> str:
-        """How far it is, and where to press next."""
+        """A line: how many cells are known, and where to press next."""
         known = self._coverage.known
         row, column = self._coverage.next_cell
         text = f"{known.sum()} of {known.size} cells are known to {100 * KNOWN_LOG:.0f} %"

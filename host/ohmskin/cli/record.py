@@ -41,10 +41,11 @@ from ohmskin.record.readings import estimate_file, load_readings, save_arrays
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import ForceSample, Mark
 
-# With a force sensor the first scans are a tare of so many seconds [s], unless told. Chosen: a
-# person who starts the command still takes a hand away in the first second.
+# With a force sensor, the scans of the first so many seconds are a tare [s], unless told. Chosen: a
+# person who starts the command may need the first second to take the hand away.
 FORCE_TARE_S: Final = 2.0
-# So many characters of a line that was typed become a mark. Chosen: a terminal takes 4096.
+# A line that was typed becomes a mark, cut to so many characters. Chosen: no mark needs as many; a
+# terminal gives up to 4096.
 _MOST_TYPED: Final = 1000
 # In place of a force sensor's port: the forces that a simulated skin knows.
 TRUTH: Final = "truth"
@@ -134,8 +135,8 @@ def is_truth(force_port: str, skin: Device) -> bool:
 def with_truth(scans: Iterable[Scan], skin: Device, recorder: Recorder) -> Iterator[Scan]:
     """Pass scans on, and record the whole force on the simulated skin beside each.
 
-    Both have the board's clock, because a scan may arrive late, and the board of a simulator may be
-    slower than the host's clock.
+    Scans and forces get their times from the board's clock, because a scan may arrive late, and the
+    board of a simulator may be slower than the host's clock.
     """
     begin_s: float | None = None  # of the board's clock, by the host's
     assert skin.true_force_n is not None

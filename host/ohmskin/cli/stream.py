@@ -70,7 +70,7 @@ def stream(
     if method not in ("", "none", *METHODS):
         raise ValueError(f"no method '{method}': there are none, {', '.join(METHODS)}")
     if method and str(calibration) == os.environ.get("OHMSKIN_CALIBRATION"):
-        calibration = None  # an option goes before what the environment says
+        calibration = None  # an option of the command counts more than the environment
     if method and calibration is not None:
         raise ValueError("say either --method or --calibration: a calibration has its own method")
     if method == "none" and focus:

@@ -9,7 +9,7 @@ from rich.segment import Segment
 
 
 def printable(text: str) -> str:
-    """The text with "?" for what a terminal may obey: escapes, ends of titles, turned letters."""
+    """The text with "?" in place of what a terminal may obey: escapes, changes of direction."""
     if text.replace("\n", "").isprintable():
         return text
     return "".join(each if each.isprintable() or each == "\n" else "?" for each in text)

@@ -32,8 +32,8 @@ ANYWHERE: Final = (0, 0)
 class KeptPresses:
     """A table of presses, and the readings under each of them, with their files.
 
-    Both files are written anew, and whole, at each change: the readings first. Where a kill comes
-    between, they have one press more than the table, which counts.
+    Both files are written anew, and whole, at each change: the readings first. If the program is
+    killed in between, the readings have one press more than the table; then the table counts.
 
     ratios: mean readings under each press, (n, R, C, 4); None: they are not known of all, as of a
         table that somebody else has made.
@@ -60,7 +60,7 @@ class KeptPresses:
         return calibrator.presses_in_readings(self.table, self.ratios)
 
     def add(self, step: Step, rest: Float, window: Iterable[Scan]) -> None:
-        """Keep one more press, that of a step which has read it from these scans.
+        """Keep one more press, which `step` has read from these scans.
 
         rest: of the cells, (R, C) [S].
         """
@@ -86,7 +86,7 @@ class KeptPresses:
         self._save()
 
     def recorded(self, scans: Iterable[Scan]) -> Iterable[Scan]:
-        """The scans: but for those of presses, none is kept."""
+        """Pass scans on. None is kept but those of presses, which `add` gets."""
         return scans
 
     def _save(self) -> None:
