@@ -23,6 +23,7 @@ using namespace rp2040;
 const uint16_t WIRING = wiring::CRC;
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
+const uint16_t SHORT_CODE = wiring::SHORT_CODE;
 
 namespace {
 using wiring::COLUMN_PINS;

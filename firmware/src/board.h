@@ -16,6 +16,8 @@ namespace board {
 extern const uint16_t WIRING;  // hello.wiring
 extern const uint32_t REF_TOP_OHM;
 extern const uint32_t REF_BOTTOM_OHM;
+// What A and B read where a cell is a short: REF_BOTTOM_OHM's share of both, in codes.
+extern const uint16_t SHORT_CODE;
 
 // Pins, converter, serial line at the default speed, clock and watchdog.
 void begin();

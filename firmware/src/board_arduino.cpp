@@ -22,6 +22,7 @@ namespace board {
 const uint16_t WIRING = wiring::CRC;
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
+const uint16_t SHORT_CODE = wiring::SHORT_CODE;
 Scanner scanner;
 const uint8_t SLOTS_OF_NEW_LENGTH = 2;
 

@@ -23,6 +23,7 @@ namespace board {
 // 0: connect nothing to them. All other unused pins are inputs with pull-ups.
 const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
 const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
+const uint16_t SHORT_CODE = wiring::SHORT_CODE;
 const uint16_t WIRING = wiring::CRC;
 
 namespace {

@@ -2,6 +2,7 @@
 #pragma once
 #include <stdint.h>
 
+#include "board_numbers.h"
 #include "core/scan_sequence.h"
 
 // The one table of what is connected where: by Arduino's numbers of pins (D4 is 4; on an RP2040,
@@ -100,6 +101,9 @@ static_assert(sizeof SENSE_INPUTS == 4, "OHMSKIN_SENSE_INPUTS: four inputs, the 
 static_assert(REF_TOP_OHM >= 100 && REF_TOP_OHM <= 10000000 && REF_BOTTOM_OHM >= 100 &&
                   REF_BOTTOM_OHM <= 10000000,
               "OHMSKIN_REF_TOP_OHM, OHMSKIN_REF_BOTTOM_OHM: in ohms, 30000 for 30 kOhm");
+
+constexpr uint16_t SHORT_CODE = static_cast<uint16_t>(
+    ((uint64_t{1} << board::ADC_BITS) - 1) * REF_BOTTOM_OHM / (REF_TOP_OHM + REF_BOTTOM_OHM));
 
 // All digital pins, in one row.
 constexpr uint8_t PINS[] = {OHMSKIN_ROW_PINS, OHMSKIN_COLUMN_PINS, OHMSKIN_DRIVE_TOP_PIN,

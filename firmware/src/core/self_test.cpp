@@ -1,31 +1,44 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/self_test.h"
 
+#include "board.h"
+#include "core/attributes.h"
+
 namespace ohmskin {
 
 namespace {
 
 // The largest code.
 constexpr uint16_t FULL_SCALE = (1u << board::ADC_BITS) - 1;
-// Codes that are surely below and above half of Vdd: 1/16 of the scale apart from it. If the larger
-// reference resistor is a quarter above the smaller one, the half moves by 1/18. Chosen: that is
-// more than resistors of a kit differ, and faults move a node to a rail.
-constexpr uint16_t HALF_LOW = FULL_SCALE / 2 - FULL_SCALE / 16;
-constexpr uint16_t HALF_HIGH = FULL_SCALE / 2 + FULL_SCALE / 16;
+// So far beyond its limit a node is surely at fault: 1/16 of the scale. If a reference resistor is
+// a quarter above what the firmware was told, limits move by 1/18 at most. Chosen: that is more
+// than resistors of a kit differ, and faults move a node to a rail. (Where one resistor is more
+// than 15 times the other, some limits are nearer to a rail than this: what lies beyond them is not
+// seen.)
+constexpr int16_t MARGIN = FULL_SCALE / 16;
 
-// What a node reads over all inputs, with its own pin high and with the other one high.
-struct Node {
-    uint16_t own_min, own_max, other_min, other_max;
+// Where the codes of a reading are, over all inputs: whether all, or some, are surely below its
+// limit, or above it.
+enum Side : uint8_t { ALL_LOW = 1, ALL_HIGH = 2, SOME_LOW = 4, SOME_HIGH = 8 };
 
-    // A short to a rail shows at every input.
-    bool stuck_low() const { return own_max < HALF_LOW && other_max < HALF_LOW; }
-    bool stuck_high() const { return own_min > HALF_HIGH && other_min > HALF_HIGH; }
-    // A node without its resistor floats wherever the skin does not hold it, so that one impossible
-    // reading is enough.
-    bool floats() const { return own_min < HALF_LOW || other_max > HALF_HIGH; }
-    // Inputs beyond the skin do so on a sound board, but not all inputs.
-    bool is_open() const { return own_max < HALF_LOW && other_min > HALF_HIGH; }
-};
+OHMSKIN_RARE uint8_t side_of(uint16_t min, uint16_t max, uint8_t reading) {
+    const uint16_t limit = (reading & 2) ? FULL_SCALE - board::SHORT_CODE : board::SHORT_CODE;
+    const int16_t low = static_cast<int16_t>(limit - MARGIN);
+    const int16_t high = static_cast<int16_t>(limit + MARGIN);
+    const int16_t least = static_cast<int16_t>(min), most = static_cast<int16_t>(max);
+    uint8_t side = 0;
+    if (least > most)  // none was taken: the converter was too slow
+        return side;
+    if (most < low)
+        side |= ALL_LOW;
+    if (least > high)
+        side |= ALL_HIGH;
+    if (least < low)
+        side |= SOME_LOW;
+    if (most > high)
+        side |= SOME_HIGH;
+    return side;
+}
 
 uint8_t index(frames::Reading reading) { return static_cast<uint8_t>(reading); }
 
@@ -44,16 +57,26 @@ static_assert(own(1) == uint8_t(Reading::C) && other(1) == uint8_t(Reading::B) &
 // Each node has three bits of the findings: stuck low, stuck high; and that a near node floats, or
 // that a far one is open.
 constexpr uint8_t BITS_A_NODE = 3;
-constexpr uint16_t STUCK = 3, LOOSE = 4;
+constexpr uint8_t STUCK = 3, LOOSE = 4;
 static_assert(uint16_t(Finding::TopStuckLow) == 1 && uint16_t(Finding::TopStuckHigh) == 2 &&
                   uint16_t(Finding::TopReferenceMissing) == LOOSE &&
                   uint16_t(Finding::BottomStuckLow) == 1 << BITS_A_NODE &&
                   uint16_t(Finding::FarTopStuckLow) == 1 << 2 * BITS_A_NODE &&
                   uint16_t(Finding::FarBottomOpen) == LOOSE << 3 * BITS_A_NODE,
               "the order of nodes and bits");
-uint16_t findings_of(const Node &node, bool far) {
-    const bool loose = far ? node.is_open() : node.floats();
-    return static_cast<uint16_t>(node.stuck_low() | node.stuck_high() << 1 | loose << 2);
+static_assert(ALL_LOW == uint8_t(Finding::TopStuckLow) &&
+                  ALL_HIGH == uint8_t(Finding::TopStuckHigh),
+              "a node that is stuck is on one side, whichever pin is high");
+
+// own, other: where a node is with its own pin high, and with the other one high. A short to a rail
+// shows at every input. A near node without its resistor floats wherever the skin does not hold it,
+// so that one impossible reading is enough. Far nodes have those on a sound board, too, at inputs
+// beyond the skin, but not at all inputs.
+uint8_t findings_of(uint8_t own, uint8_t other, bool far) {
+    uint8_t found = own & other & STUCK;
+    if (far ? (own & ALL_LOW) && (other & ALL_HIGH) : (own & SOME_LOW) || (other & SOME_HIGH))
+        found |= LOOSE;
+    return found;
 }
 
 // What is looked for first. A node at a rail pulls others across half of Vdd: through a pressed
@@ -108,8 +131,10 @@ void SelfTest::take(const uint16_t *codes) {
 frames::SelfTestReport SelfTest::report() const {
     uint16_t found = 0;
     for (uint8_t n = far_ ? NODES : NEAR_NODES; n-- != 0;) {
-        const Node node = {min_[own(n)], max_[own(n)], min_[other(n)], max_[other(n)]};
-        found = static_cast<uint16_t>(found << BITS_A_NODE | findings_of(node, n >= NEAR_NODES));
+        const uint8_t of_node =
+            findings_of(side_of(min_[own(n)], max_[own(n)], own(n)),
+                        side_of(min_[other(n)], max_[other(n)], other(n)), n >= NEAR_NODES);
+        found = static_cast<uint16_t>(found << BITS_A_NODE | of_node);
     }
     frames::SelfTestReport report;
     for (uint8_t n = 0; n < sizeof ORDER / sizeof *ORDER; n++) {

@@ -10,9 +10,10 @@ namespace ohmskin {
 // Judges the sense nodes by one scan of all multiplexer inputs; in mode far by two more, for the
 // far nodes.
 //
-// With equal reference resistors a node cannot read below half of Vdd while its own pin is high,
-// nor above it while the pin is low, whatever the skin does: current only ever flows through both
-// resistors in series. So what reads otherwise is a fault of the wiring.
+// Current only ever flows through both reference resistors in series. So with its own pin high a
+// node reads at least the other resistor's share of the two, and with the other pin high at most
+// its own resistor's share, whatever the skin does: half of Vdd where the resistors are equal. What
+// reads otherwise is a fault of the wiring.
 //
 // A far node has no resistor. One that is connected to nothing keeps the potential that the sample
 // capacitor brings, that of the reading before. The self-test's patterns therefore read a near node

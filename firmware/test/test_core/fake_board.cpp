@@ -14,8 +14,9 @@ namespace board {
 using fake::state;
 
 const uint16_t WIRING = 0x1234;
-const uint32_t REF_TOP_OHM = 30000;
-const uint32_t REF_BOTTOM_OHM = 29000;
+const uint32_t REF_TOP_OHM = 2200;
+const uint32_t REF_BOTTOM_OHM = 4700;
+const uint16_t SHORT_CODE = 696;
 Scanner scanner;
 const uint8_t SLOTS_OF_NEW_LENGTH = 2;
 

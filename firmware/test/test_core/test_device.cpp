@@ -125,12 +125,13 @@ struct Bench {
         host.rewind();
     }
     // Runs slots like the hardware: a pass of the main loop or more after each.
-    OHMSKIN_APART void slots(uint16_t count, uint16_t (*code_of)(const Selection &)) {
+    OHMSKIN_APART void slots(uint16_t count, uint16_t (*code_of)(const Selection &),
+                             uint8_t converted = 1) {
         while (count--) {
             const uint16_t code = result;
             result = code_of(pins);
             pins = board::scanner.selection();
-            board::scanner.step(code, 1);
+            board::scanner.step(code, converted);
             host.work(2);
         }
         host.work();
@@ -183,7 +184,7 @@ TEST(boot_sends_hello_with_defaults_from_a_blank_eeprom) {
     CHECK_EQ(0x1234, hello.wiring);
     CHECK_BYTES(board::NAME, hello.board, sizeof board::NAME);
     CHECK_EQ(16, hello.rows_max);
-    CHECK_EQ(29000, hello.ref_bottom_ohm);
+    CHECK_EQ(4700, hello.ref_bottom_ohm);
     CHECK(!host.next(&frame));
 }
 
@@ -437,47 +438,68 @@ TEST(an_unconfirmed_speed_falls_back) {
 }
 
 namespace {
-// Nodes as a skin of 1 MOhm cells and 30 kOhm resistors reads, and as faults make them.
-// In mode near, pattern entries 0 to 3 are A to D.
-uint16_t sound(const Selection &s) { return (s.pattern_entry & 1) ? 30 : 993; }
-uint16_t bottom_low(const Selection &s) {
-    return s.pattern_entry == 0 ? 993 : s.pattern_entry == 3 ? 29 : 0;
+// The codes of A to D, which in mode near are pattern entries 0 to 3.
+const uint16_t *nodes;
+uint16_t of_nodes(const Selection &s) { return nodes[s.pattern_entry]; }
+
+OHMSKIN_APART bool self_test_of(Bench &bench, frames::SelfTestReport *report) {
+    Frame frame;
+    if (!CHECK(!fake::state.slots_running) || !CHECK(bench.host.next(&frame)))
+        return false;
+    CHECK_EQ(Type::SelfTestReport, static_cast<Type>(frame.type));
+    memcpy(report, frame.payload, sizeof *report);
+    CHECK_EQ(Result::Ok, bench.host.answer(Type::SelfTest));
+    return true;
 }
-uint16_t top_high(const Selection &s) {
-    return (s.pattern_entry & 1) == 0 ? 1023 : s.pattern_entry == 3 ? 1023 : 30;
-}
-uint16_t no_top_resistor(const Selection &s) { return s.pattern_entry < 2 ? 0 : 1020; }
-uint16_t all_pressed(const Selection &s) { return (s.pattern_entry & 1) ? 500 : 523; }
 }  // namespace
 
 TEST(self_test_names_what_no_skin_can_cause) {
     using frames::Finding;
+    // By the resistors of fake_board.cpp, 2.2 kOhm at the top and 4.7 kOhm at the bottom. Where all
+    // cells are a short, A and B read 697, C and D 326.
     const struct {
-        uint16_t (*skin)(const Selection &);
-        uint16_t findings;
+        uint16_t codes[4];
+        Finding finding;
     } cases[] = {
-        {sound, 0},
-        {all_pressed, 0},
-        {bottom_low, static_cast<uint16_t>(Finding::BottomStuckLow)},
-        {top_high, static_cast<uint16_t>(Finding::TopStuckHigh)},
-        {no_top_resistor, static_cast<uint16_t>(Finding::TopReferenceMissing)},
+        {{1020, 4, 1018, 2}, {}},    // 1 MOhm
+        {{744, 597, 426, 279}, {}},  // 1 kOhm and two multiplexers
+        {{697, 697, 326, 326}, {}},  // a short
+        {{650, 744, 279, 373}, {}},  // the same, with resistors that are off by a quarter
+        {{993, 0, 0, 29}, Finding::BottomStuckLow},
+        {{1023, 1023, 1023, 2}, Finding::BottomStuckHigh},
+        {{0, 0, 1018, 0}, Finding::TopStuckLow},
+        {{1023, 30, 1023, 1023}, Finding::TopStuckHigh},
+        {{0, 0, 1020, 1020}, Finding::TopReferenceMissing},
+        {{1020, 1020, 0, 0}, Finding::BottomReferenceMissing},
     };
     for (const auto &c : cases) {
         Bench &bench = fresh();
+        nodes = c.codes;
         bench.host.send(Type::SelfTest);
         CHECK(fake::state.slots_running);
-        bench.slots(1 + 1024 + 4, c.skin);
-        CHECK(!fake::state.slots_running);
-        Frame frame;
-        if (!CHECK(bench.host.next(&frame)))
-            return;
-        CHECK_EQ(Type::SelfTestReport, static_cast<Type>(frame.type));
+        bench.slots(1 + 1024 + 4, of_nodes);
         frames::SelfTestReport report;
-        memcpy(&report, frame.payload, sizeof report);
-        CHECK_EQ(c.findings, report.findings);
-        CHECK_EQ(c.skin(Selection{0, 0, 2}), report.code_max[2]);
-        CHECK_EQ(Result::Ok, bench.host.answer(Type::SelfTest));
+        if (!self_test_of(bench, &report))
+            return;
+        CHECK_EQ(static_cast<uint16_t>(c.finding), report.findings);
+        CHECK_EQ(c.codes[2], report.code_max[2]);
     }
+}
+
+// As where the board is too slow: then C and D are not read.
+TEST(self_test_judges_no_reading_that_it_has_not_taken) {
+    Bench &bench = fresh();
+    const uint16_t codes[] = {1020, 4, 1018, 2};
+    nodes = codes;
+    bench.host.send(Type::SelfTest);
+    bench.slots(40, of_nodes);
+    bench.slots(1024, of_nodes, 0);
+    frames::SelfTestReport report;
+    if (!self_test_of(bench, &report))
+        return;
+    CHECK_EQ(0, report.findings);
+    CHECK_EQ(1020, report.code_max[0]);
+    CHECK(report.code_min[2] > report.code_max[2]);
 }
 
 TEST(scans_that_never_fit_the_line_are_refused) {
