@@ -172,6 +172,7 @@ constexpr uint16_t FIRST_AFTER = 8;
 
 Scanner scanner;
 const uint8_t SLOTS_OF_NEW_LENGTH = 1;
+const uint16_t SELF_TEST_SETTLE_US = 50;
 
 extern "C" void slot_interrupt() {
     // The channel has been set in the slot before, with the pins.

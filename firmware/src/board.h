@@ -38,6 +38,10 @@ extern Scanner scanner;
 // How many slots have the new length before the first reading of a scan whose slots are of another
 // one: 2 where the slot at hand takes it, 1 where the next one does.
 extern const uint8_t SLOTS_OF_NEW_LENGTH;
+// Settle time [us] of the self-test's scans; a test need not be fast. 50 or more: the largest node
+// that the firmware reckons with, 244 pF at 30 kOhm (docs/timing.md, "Mode far"), has a time
+// constant of 7.3 us, and is off by a code after 50 us.
+extern const uint16_t SELF_TEST_SETTLE_US;
 void start_slots(uint16_t slot_cycles, uint8_t accuracy);
 void stop_slots();
 

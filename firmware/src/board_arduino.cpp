@@ -25,6 +25,9 @@ const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
 const uint16_t SHORT_CODE = wiring::SHORT_CODE;
 Scanner scanner;
 const uint8_t SLOTS_OF_NEW_LENGTH = 2;
+// An Uno takes 230 us for a reading by these calls. Scans that it cannot keep up with would lose
+// readings, and the self-test could judge none of them.
+const uint16_t SELF_TEST_SETTLE_US = 230;
 
 namespace {
 // A slot may come so late [us], and its scan still counts. Chosen: what stamps may be off.

@@ -94,6 +94,7 @@ inline void pins_set(uint8_t row, uint8_t column, uint8_t drive) {
 // ----------------------------------------------------------------------------------- slots
 Scanner scanner;
 const uint8_t SLOTS_OF_NEW_LENGTH = 2;
+const uint16_t SELF_TEST_SETTLE_US = 50;
 
 namespace {
 

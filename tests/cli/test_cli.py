@@ -24,7 +24,9 @@ from ohmskin.emulate.scale import SCALE_OPTIONS
 from ohmskin.emulate.scenes import BEGIN_S, LEAD_OHM, SCENES, Scene
 from ohmskin.estimate.methods import METHODS
 from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.messages import SelfTestReport
 from ohmskin.link.protocol import ENUMS, LAYOUT_CRC
+from ohmskin.link.session import Session
 from ohmskin.record.readings import estimate_file, load_readings
 from places import DATA
 from ports import Attach, Serve
@@ -63,6 +65,16 @@ def test_info(run: Run) -> None:
         page = well(run("info", f"{EMULATED}&mode={mode}", "--self-test")).out
         codes = page[page.index("codes") : page.index("findings")]
         assert re.findall("[A-H]", codes) == list(names)
+
+
+def test_readings_that_the_self_test_did_not_take_are_not_called_sound(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = SelfTestReport((), (1000, 3, *[1023] * 6), (1023, 30, *[0] * 6))
+    monkeypatch.setattr(Session, "self_test", lambda _: report)
+    page = well(run("info", EMULATED, "--self-test")).out
+    assert re.search(r"A 1000 to 1023, B 3 to 30 *\n", page)
+    assert "none, but other readings came too late to be judged" in page
 
 
 def test_info_is_in_peoples_units(run: Run) -> None:

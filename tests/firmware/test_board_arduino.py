@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from firmware_helpers import CYCLES_PER_US, assert_whole
-from lockstep import LockstepSim, Rig, elf_of
+from lockstep import DEFAULT_SCAN, LockstepSim, Rig, elf_of
 
 pytestmark = [
     pytest.mark.simavr,
@@ -61,6 +61,18 @@ def test_a_rate_that_it_cannot_keep_costs_scans_and_nothing_is_wrong(rig: Rig) -
             assert np.abs(stamp_errors_us(rig)).max() < 1000
             last = rig.scans[-1].header
             assert last["scan"] + 1 == len(rig.scans) + last["dropped"]
+
+
+def test_its_self_test_reads_all_that_it_judges(rig: Rig) -> None:
+    """Once its slots were too short for these calls: c and d were not read, and so judged wrong."""
+    rig.sim.set_table(np.tile([1.0, 0.0], (16, 16, 4)))
+    for mode, readings in (("near", 4), ("far", 8)):
+        rig.must("configure", **(DEFAULT_SCAN | {"rate_mhz": 1000, "mode": mode}))
+        rig.must("self_test", limit_s=1.0)
+        report = rig.frames("self_test_report")[-1]
+        assert report["findings"] == ()
+        assert report["code_max"][:readings] == report["code_min"][:readings]
+        assert report["code_max"][:readings] == (1023, 0) * (readings // 2)
 
 
 def test_settings_last(rig: Rig) -> None:

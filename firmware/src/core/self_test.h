@@ -2,6 +2,7 @@
 #pragma once
 #include <stdint.h>
 
+#include "board.h"
 #include "core/scan_plan.h"
 #include "core/scanner.h"
 
@@ -23,18 +24,14 @@ class SelfTest {
     OHMSKIN_RARE void begin(const ScanRequest &skin);
     // How the next scan takes all inputs, whatever the skin's size: a wire may be in the wrong one.
     Route route(uint16_t cycles_per_byte) const {
-        return plan_whole(ROWS_MAX, COLUMNS_MAX, pattern_, SETTLE_US, cycles_per_byte);
+        return plan_whole(ROWS_MAX, COLUMNS_MAX, pattern_, board::SELF_TEST_SETTLE_US,
+                          cycles_per_byte);
     }
     OHMSKIN_RARE void take(const uint16_t *codes);  // the scan's groups, in order
     OHMSKIN_RARE bool next();                       // to the next scan; false: it was the last one
     OHMSKIN_RARE frames::SelfTestReport report() const;
 
   private:
-    // Settle time [us] of the self-test's scans. Chosen: the largest node that the firmware reckons
-    // with, 244 pF at 30 kOhm (docs/timing.md, "Mode far"), has a time constant of 7.3 us, and is
-    // off by a code after 50 us. A test need not be fast.
-    static constexpr uint16_t SETTLE_US = 50;
-
     // Smallest and largest code of each reading, over all inputs.
     uint16_t min_[frames::READINGS] = {};
     uint16_t max_[frames::READINGS] = {};

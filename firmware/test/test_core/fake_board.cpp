@@ -19,6 +19,7 @@ const uint32_t REF_BOTTOM_OHM = 4700;
 const uint16_t SHORT_CODE = 696;
 Scanner scanner;
 const uint8_t SLOTS_OF_NEW_LENGTH = 2;
+const uint16_t SELF_TEST_SETTLE_US = 50;
 
 void begin() {}
 uint8_t reset_cause() { return static_cast<uint8_t>(frames::ResetCause::External); }

@@ -107,10 +107,12 @@ def info(
     for name, text in _board_in_words(board).items():
         table.add_row(name, text)
     if tested is not None:
-        ranges = zip("ABCDEFGH", tested.code_min, tested.code_max, strict=True)
-        taken = [f"{name} {low} to {high}" for name, low, high in ranges if low <= high]
-        table.add_row("codes", ", ".join(taken))
-        table.add_row("findings", ", ".join(findings) or "none")
+        ranges = zip("abcdefgh", tested.code_min, tested.code_max, strict=True)
+        taken = {name: f"{low} to {high}" for name, low, high in ranges if low <= high}
+        table.add_row("codes", ", ".join(f"{n.upper()} {codes}" for n, codes in taken.items()))
+        all_came = {*MODES["near"], *MODES[board.mode]} <= taken.keys()
+        none = "none" if all_came else "none, but other readings came too late to be judged"
+        table.add_row("findings", ", ".join(findings) or none)
     TERMINAL.print(table)
     for finding in findings:
         doc = ENUMS["finding"].docs.get(finding, "a finding of a newer firmware")
