@@ -24,7 +24,6 @@ int main(int argc, char **argv) {
                                             {"pty", no_argument, NULL, 'p'},
                                             {0}};
     const struct board *board = NULL;
-    struct board wired; /* the board with another wiring */
     const char *loader = NULL, *pins = NULL;
     bool pty = false;
     for (int option; (option = getopt_long(argc, argv, "", OPTIONS, NULL)) != -1;) {
@@ -45,12 +44,10 @@ int main(int argc, char **argv) {
         loader = board->loader;
     if (!board || optind != argc - 1)
         return usage();
-    if (pins) {
-        wired = *board;
-        board = &wired;
-        if (!skin_read_wiring(pins, &wired.wiring))
-            return usage();
-    }
+    struct board wired = *board;
+    if (!wiring_of_firmware(argv[optind], &wired) ||
+        (pins && !wiring_of_option(pins, &wired.wiring)))
+        return 2;
 
     /* libsimavr prints on stdout; only replies may go there. */
     const int replies = dup(STDOUT_FILENO);
@@ -60,7 +57,7 @@ int main(int argc, char **argv) {
     }
     signal(SIGPIPE, SIG_IGN);
     control_start(STDIN_FILENO, replies);
-    if (!cpu_start(board, argv[optind], loader))
+    if (!cpu_start(&wired, argv[optind], loader))
         return 1;
     if (pty)
         return pty_run();

@@ -11,6 +11,9 @@
 /* Of Debian's arduino-core-avr. */
 #define LOADERS "/usr/share/arduino/hardware/arduino/avr/bootloaders/"
 
+/* A reference resistor of docs/build.md. */
+#define REF_OHM 30e3
+
 /* The one table of pins. PINx, DDRx and PORTx follow each other in data space. Of all ports: the
  * pins that a board can use, without the crystal's and the reset pin. */
 static const struct port UNO[] = {{0x25, 0x3F}, {0x28, 0x3F}, {0x2B, 0xFF}, {0, 0}};
@@ -32,7 +35,10 @@ static const struct board BOARDS[] = {
                  {0x2B, 2},
                  {0x2B, 3}},
                 {0, 1, 2, 3},
-                ADDRESS_PINS},
+                ADDRESS_PINS,
+                {REF_OHM, REF_OHM},
+                false},
+     .arduino_pins = "D0D1D2D3D4D5D6D7B0B1B2B3B4B5C0C1C2C3C4C5",
      .ports = UNO,
      .analog_port = 0x28,
      .tx = {0x2B, 1 << 1},
@@ -51,7 +57,12 @@ static const struct board BOARDS[] = {
                  {0x10B, 0},
                  {0x10B, 1}},
                 {0, 1, 2, 3},
-                ADDRESS_PINS},
+                ADDRESS_PINS,
+                {REF_OHM, REF_OHM},
+                false},
+     .arduino_pins = "E0E1E4E5G5E3H3H4H5H6B4B5B6B7J1J0H1H0D3D2D1D0A0A1A2A3A4A5A6A7"
+                     "C7C6C5C4C3C2C1C0D7G2G1G0L7L6L5L4L3L2L1L0B3B2B1B0"
+                     "F0F1F2F3F4F5F6F7K0K1K2K3K4K5K6K7",
      .ports = MEGA,
      .analog_port = 0x31,
      .tx = {0x2E, 1 << 1},
@@ -75,7 +86,6 @@ static struct {
  * the lines' near ends (rows first), their far ends, the nodes and the sample capacitor. */
 enum { SAMPLE = SKIN_ENDS + NODES, STATES };
 enum { MATRICES = CONFIG_OTHER };
-#define REF_OHM 30e3
 #define MUX_OHM 1.0
 /* Where nothing else is: it settles in 0.3 ns. */
 #define STRAY_PF 0.01
@@ -96,30 +106,7 @@ const struct board *skin_find_board(const char *name) {
     return NULL;
 }
 
-bool skin_read_wiring(const char *text, struct wiring *wiring) {
-    static const char LETTERS[] = "ABCDEFGHJKL";
-    static const uint16_t PORTS[] = {0x22, 0x25,  0x28,  0x2B,  0x2E, 0x31,
-                                     0x34, 0x102, 0x105, 0x108, 0x10B};
-    unsigned pins = 0;
-    for (const char *at = text; *at == 'P'; at += strcspn(at, ",") + 1)
-        pins++;
-    wiring->address_pins = pins == PINS_MAX ? ADDRESS_PINS_MAX : ADDRESS_PINS;
-    if (pins != 2u * wiring->address_pins + 2)
-        return false;
-    for (unsigned i = 0; i < pins; i++) {
-        const char *letter = text[0] == 'P' && text[1] ? strchr(LETTERS, text[1]) : NULL;
-        if (!letter || text[2] < '0' || text[2] > '7' || text[3] != ',')
-            return false;
-        wiring->pins[i] = (struct pin){PORTS[letter - LETTERS], (uint8_t)(text[2] - '0')};
-        text += 4;
-    }
-    for (unsigned node = 0; node < NODES; node++, text++) {
-        if (*text < '0' || *text > '7' || text[1] != (node + 1 < NODES ? ',' : '\0'))
-            return false;
-        wiring->channels[node] = (uint8_t)(*text++ - '0');
-    }
-    return true;
-}
+const struct wiring *skin_wiring(void) { return &skin.board->wiring; }
 
 unsigned skin_node_at(unsigned channel) {
     for (unsigned node = 0; node < NODES; node++)
@@ -150,12 +137,20 @@ static bool is_circuit(void) {
     return settings.line_pf > 0 || settings.node_pf > 0 || settings.sample_pf > 0;
 }
 
-/* Without lines, each node hangs on a source with the table's voltage. Of the reference resistor
+static double ref_ohm(unsigned node) { return skin.board->wiring.ref_ohm[node % DRIVEN_NODES]; }
+
+/* Whether a node's own drive pin is high; a far node has that of its line's near end. */
+static bool is_high(unsigned node) {
+    return node % DRIVEN_NODES == NODE_TOP ? skin.top_high : skin.bottom_high;
+}
+
+/* Without lines, each node hangs on a source with the table's voltage. Of the reference resistor R
  * and the skin behind it, R (1 - R I) is the parallel, and 1 - R I is A, C, 1 - B or 1 - D. What
- * the wires add to a far end is left out. */
+ * the wires add to a far end is left out. A node at a rail is not nearer to it than this. */
+#define LEAST_SHARE 0.01
 static double source_ohm(unsigned node) {
-    const double ratio = target(node) > 1 ? 1 : target(node) < 0 ? 0 : target(node);
-    return REF_OHM * fmax(ratio, 1 - ratio);
+    const double share = is_high(node) ? target(node) : 1 - target(node);
+    return ref_ohm(node) * fmin(1, fmax(LEAST_SHARE, share));
 }
 
 /* The states of the circuit: lines that carry something, if lines have a capacitance, and the rest.
@@ -187,7 +182,7 @@ static struct modes *make_modes(size_t n, const size_t states[n]) {
         if (settings.line_pf <= 0)
             siemens[at][at] = 1 / source_ohm(node);
         else if (!skin.undriven && node < DRIVEN_NODES)
-            siemens[at][at] = 1 / REF_OHM;
+            siemens[at][at] = 1 / ref_ohm(node);
         const bool is_joined = node < DRIVEN_NODES || settings.far_open < 0.5;
         if (is_joined && settings.line_pf > 0 && circuit.siemens[line][line] > 0)
             join(siemens, at, line, 1 / MUX_OHM);
@@ -242,10 +237,9 @@ static void advance(instant when) {
         ampere[i] = 0;
     }
     for (unsigned node = 0; node < NODES; node++) {
-        const bool high = node == NODE_TOP ? skin.top_high : skin.bottom_high;
         const bool driven = node < DRIVEN_NODES && !skin.undriven;
         ampere[n - 1 - NODES + node] = settings.line_pf <= 0 ? target(node) / source_ohm(node)
-                                       : driven              ? high / REF_OHM
+                                       : driven              ? is_high(node) / ref_ohm(node)
                                                              : 0;
     }
     modes_advance(*modes, ampere, (double)(when - circuit.since) / CPU_HZ, volt);

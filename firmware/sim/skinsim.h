@@ -94,25 +94,26 @@ struct pin {
     uint8_t bit;
 };
 /* Address pins of rows and as many of columns, and the drive pins, top first; the converter's
- * channels, by node. */
+ * channels, by node; the reference resistors, top and bottom; whether the firmware has told it. */
 enum { ADDRESS_PINS = 4, ADDRESS_PINS_MAX = 5, PINS_MAX = 2 * ADDRESS_PINS_MAX + 2 };
 struct wiring {
     struct pin pins[PINS_MAX];
     uint8_t channels[NODES];
     uint8_t address_pins;
+    double ref_ohm[DRIVEN_NODES];
+    bool told;
 };
 struct board {
     const char *name, *mcu;
     struct wiring wiring;
+    const char *arduino_pins; /* port and bit of each, by Arduino's numbers */
     const struct port *ports; /* to a mask of 0 */
     uint16_t analog_port;     /* channels 0 to 7 of the converter are its pins */
     struct port tx;
     const char *loader; /* with which it is sold */
 };
 const struct board *skin_find_board(const char *name);
-/* Another wiring of the board, as in PD4,PD5,PD6,PD7,PB0,PB1,PB2,PB3,PD2,PD3,0,1,2,3: with four
- * address pins each for rows and columns, or with five. False: it is none. */
-bool skin_read_wiring(const char *text, struct wiring *wiring);
+const struct wiring *skin_wiring(void);
 /* The node at a channel of the converter; NODES: none is. */
 unsigned skin_node_at(unsigned channel);
 void skin_start(const struct board *board);
@@ -137,6 +138,14 @@ struct skin_pins {
     uint8_t row, column, configuration;
 };
 struct skin_pins skin_pins(unsigned node);
+
+/* ---- wiring.c: wirings other than the board's own. False: said on stderr why it is none. */
+
+/* As the firmware tells it; where it does not, the wiring stays. */
+bool wiring_of_firmware(const char *elf_path, struct board *board);
+/* As in PD4,PD5,PD6,PD7,PB0,PB1,PB2,PB3,PD2,PD3,0,1,2,3: with four address pins each for rows and
+ * columns, or with five. */
+bool wiring_of_option(const char *text, struct wiring *wiring);
 
 /* ---- network.c: C dv/dt = -G v + i */
 

@@ -236,6 +236,9 @@ char *stats_json(void) {
     COUNT(idle_cycles);
     COUNT(passes);
 #undef COUNT
+    const struct wiring *wiring = skin_wiring();
+    fprintf(out, wiring->told ? "\"ref_ohm\": [%.0f, %.0f], " : "\"ref_ohm\": null, ",
+            wiring->ref_ohm[NODE_TOP], wiring->ref_ohm[NODE_BOTTOM]);
     fprintf(out, "\"floating_pins\": %u, ", skin_floating_pins());
     print_gap(out, "settle_cycles", &stats.settle);
     print_gap(out, "channel_settle_cycles", &stats.channel_settle);

@@ -7,7 +7,7 @@
 
 // The one table of what is connected where: by Arduino's numbers of pins (D4 is 4; on an RP2040,
 // GP4 is 4) and of analog inputs (A0 is 0). The defaults are those of docs/build.md. A board that
-// is wired otherwise is told by build_flags in platformio.ini, any of these:
+// is wired otherwise is told by build_flags in platformio.ini (docs/wiring.md), any of these:
 //
 //     -DOHMSKIN_ROW_PINS=4,5,6,7       S0 to S3 of the row multiplexers
 //     -DOHMSKIN_COLUMN_PINS=8,9,10,11  S0 to S3 of the column multiplexers
@@ -124,6 +124,20 @@ constexpr uint16_t crc_of(const uint8_t *list, uint8_t size, uint16_t crc) {
 // Of the pins above, in that order; 0: those of docs/build.md.
 constexpr uint16_t CRC =
     OHMSKIN_OWN_PINS ? crc_of(SENSE_INPUTS, 4, crc_of(PINS, PIN_COUNT, 0xFFFF)) : 0;
+
+#if defined(__AVR__)
+// The same for simulators, which read it in the ELF file; it takes no memory of the board. (The
+// section's name brings flags of its own, and the semicolon makes those of the compiler a comment:
+// it would put the table into the flash.)
+struct Table {
+    uint8_t pins[PIN_COUNT], sense_inputs[4];
+    uint32_t ref_ohm[2];
+};
+__attribute__((used, section(".ohmskin.wiring,\"\",@progbits;"))) const Table TABLE = {
+    {OHMSKIN_ROW_PINS, OHMSKIN_COLUMN_PINS, OHMSKIN_DRIVE_TOP_PIN, OHMSKIN_DRIVE_BOTTOM_PIN},
+    {OHMSKIN_SENSE_INPUTS},
+    {REF_TOP_OHM, REF_BOTTOM_OHM}};
+#endif
 
 // How often a number is in a list.
 constexpr uint8_t count(const uint8_t *list, uint8_t size, uint8_t number) {

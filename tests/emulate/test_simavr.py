@@ -80,6 +80,14 @@ def test_what_ends_the_simulator(build: Build, sent: bytes, ops: bytes) -> None:
     assert len(done.stdout[5:]) == sum(done.stdout[1:5])  # one reply, and short
 
 
+BAD_PINS = {
+    "4,12": "--pins has 2 values: there should be 4 or 5 pins of rows and as many",
+    "D4,D5,D6,D7,D8,D9,D10,D11,D2,D3,0,1,2,3": "'D4' is no pin: write port and bit, as PD4",
+    "PD4,PD5,PD6,PD8,PB0,PB1,PB2,PB3,PD2,PD3,0,1,2,3": "'PD8' is no pin",
+    "PD4,PD5,PD6,PD7,PB0,PB1,PB2,PB3,PD2,PD3,0,1,2,9": "'9' is no channel: there are 0 to 7",
+}
+
+
 def test_program_errors(build: Build, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     elf = build("uno", FOREVER)
     with pytest.raises(FileNotFoundError, match=r"none\.elf is missing: run 'make firm"):
@@ -89,7 +97,11 @@ def test_program_errors(build: Build, tmp_path: Path, monkeypatch: pytest.Monkey
     (tmp_path / "not.elf").write_bytes(b"no ELF")
     with pytest.raises(SimulationError, match="cannot load"):
         LockstepSim("uno", tmp_path / "not.elf")
+    for pins, wrong in BAD_PINS.items():
+        with pytest.raises(SimulationError, match=wrong):
+            LockstepSim("uno", elf, pins=pins)
     sim = LockstepSim("uno", elf)
+    assert sim.stats()["ref_ohm"] is None  # this program says nothing of its wiring
     sim.close()
     sim.close()
     with pytest.raises(SimulationError, match="closed"):

@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +32,8 @@ BOARDS: Final = ("uno", "megaatmega2560")
 _REPOSITORY: Final = Path(__file__).resolve().parents[3]
 # The simulator, in a checkout; it need not exist.
 PROGRAM: Final = _REPOSITORY / "firmware" / "sim" / "build" / "skinsim"
+# Where PlatformIO leaves the firmware of all boards.
+_BUILT: Final = _REPOSITORY / ".pio" / "build"
 # Requests and replies begin with an operation (u8) and the length of what follows (u32):
 # firmware/sim/README.md.
 _HEADER: Final = struct.Struct("<BI")
@@ -174,7 +177,7 @@ class SimavrLink(SerialLink):
     ) -> None:
         if board not in BOARDS:
             raise PortError(f"no simulated board '{board}': there are {', '.join(BOARDS)}")
-        elf = _REPOSITORY / ".pio" / "build" / board / "firmware.elf"
+        elf = _BUILT / board / "firmware.elf"
         own = dict(settings)
         # A board on a desk has the boot loader that it is sold with.
         loader = own.pop("bootloader", "board" if "desk" in own else "")
@@ -185,6 +188,12 @@ class SimavrLink(SerialLink):
                 self.sim.set(**own)
                 self._load_eeprom()
                 self._scene = scene
+                # The board is wired as the firmware's ELF file says; the skin is, too.
+                references = json.loads(self.sim.request("S")).get("ref_ohm")
+                if references is None:
+                    raise PortError(f"{elf} does not tell its wiring: run 'make firmware sim'")
+                top, bottom = references
+                scene.faults = replace(scene.faults, ref_top=top, ref_bottom=bottom)
                 # Since when [s] the board has read the skin of which time of the scene [s].
                 self._shown_s: deque[tuple[float, float]] = deque(maxlen=_SHOWN_TABLES)
                 self._show(0.0)
