@@ -174,6 +174,19 @@ def test_a_hand_on_most_of_the_skin_is_seen(sound: Evidence) -> None:
     assert diagnosis.findings == []
 
 
+def test_a_converters_gain_is_no_fault_of_unequal_references(sound: Evidence) -> None:
+    """2.2 and 4.7 kOhm show few codes of an untouched skin, and other shares of the gain."""
+    random, refs = np.random.default_rng(3), {"ref_top_ohm": 2200, "ref_bottom_ohm": 4700}
+    board = replace(sound.board, rows=8, columns=8, row_mask=255, column_mask=255, **refs)
+    skin = replace(Scene("rest", 8, 8).rest, **refs)
+    for gain in (1 - 2 / 1024, 1 + 2 / 1024):
+        exact = 1024 * gain * readings(skin) + 0.7 * random.standard_normal((400, 8, 8, 4))
+        codes = np.clip(np.floor(exact), 0, 1023).mean(axis=0)
+        diagnosis = Diagnosis()
+        examine_circuit(Rest(board, codes, 400, 0.7, (100.0, 200.0)), diagnosis)
+        assert diagnosis.findings == []
+
+
 def test_lines_that_are_not_there_are_one_finding() -> None:
     bench = stepped("emulator://4x6")
     bench.configure(rows=7, rate_hz=0)

@@ -234,13 +234,17 @@ def _reference_ratio(shown: Float, rest: Rest, diagnosis: Diagnosis) -> float:
 
     shown: what the readings show of the current, of ports that draw some, (P, 4) [LSB].
     """
-    ratio = float(shown[:, READING_SENSES_TOP].sum() / shown[:, ~READING_SENSES_TOP].sum())
-    mean_lsb = float(shown.mean())
+    top_lsb = float(shown[:, READING_SENSES_TOP].mean())
+    bottom_lsb = float(shown[:, ~READING_SENSES_TOP].mean())
+    ratio = top_lsb / bottom_lsb
     # A and D round alike, and so do B and C: of four readings, two are independent.
-    ratio_std = rest.std_lsb * 2**0.5 / (mean_lsb * len(shown) ** 0.5)
+    ratio_std = rest.std_lsb * np.hypot(1 / top_lsb, 1 / bottom_lsb) / len(shown) ** 0.5
     top, bottom = rest.board.ref_top_ohm, rest.board.ref_bottom_ohm
     off = ratio * bottom / top - 1
-    doubt = limits.FEW_STDS * ratio_std + 2 * rest.offset_lsb / mean_lsb
+    doubt = limits.FEW_STDS * ratio_std + rest.offset_lsb * (1 / top_lsb + 1 / bottom_lsb)
+    # Both sides have the same of rounding, and of the gain's error, which A and C alone show.
+    both_lsb = limits.ROUNDING_LSB + limits.ADC_ERROR_LSB / 2
+    doubt += both_lsb * abs(1 / top_lsb - 1 / bottom_lsb)
     if abs(off) >= RATIO_TOLERANCE + doubt:
         nominal = {"ref_top_ohm": top, "ref_bottom_ohm": bottom}
         diagnosis.add(Kind.REFERENCE_RATIO, ratio=ratio, off_percent=100 * off, **nominal)
