@@ -2,10 +2,13 @@
 """Boards that are wired otherwise: their firmware, and the same wiring for the simulators."""
 
 import binascii
+import json
 import os
 import re
+import struct
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -50,16 +53,23 @@ class PinMap:
     @property
     def crc(self) -> int:
         """What `hello` says of it: binascii's CRC of its pins, in the order of wiring.h."""
-        return binascii.crc_hqx(
-            bytes((*self.rows, *self.columns, *self.drive, *self.sense)), 0xFFFF
-        )
+        return binascii.crc_hqx(bytes(self.numbers), 0xFFFF)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """All of it, in the order of wiring.h."""
+        return *self.rows, *self.columns, *self.drive, *self.sense
 
     def pins(self, board: str) -> str:
         """The option --pins of both simulators."""
-        ports = _ports(board)
-        wired = [ports[pin] for pin in (*self.rows, *self.columns, *self.drive)]
-        return ",".join([*wired, *map(str, self.sense)])
+        return pins_option(board, self.numbers)
 
+
+# docs/build.md.
+DEFAULT = {
+    "uno": PinMap((4, 5, 6, 7), (8, 9, 10, 11), (2, 3), (0, 1, 2, 3)),
+    "megaatmega2560": PinMap((22, 23, 24, 25), (37, 36, 35, 34), (49, 48), (0, 1, 2, 3)),
+}
 
 # Three for each board: all ports that it has, among the sense pins too; blocks in other places; the
 # lamp's pin, and analog inputs as outputs.
@@ -95,24 +105,73 @@ def _ports(board: str) -> tuple[str, ...]:
     return tuple(f"P{port}{bit}" for port, bit in zip(ports, bits, strict=True))
 
 
-def build(board: str, flags: str, place: Path) -> Path:
-    """Build the firmware with these flags below `place`; its ELF file.
+def pins_option(board: str, numbers: Sequence[int]) -> str:
+    """The option --pins of both simulators, of a wiring in the order of wiring.h."""
+    ports = _ports(board)
+    return ",".join([*(ports[pin] for pin in numbers[:-4]), *map(str, numbers[-4:])])
 
-    :raises subprocess.CalledProcessError: it does not compile; its `stdout` says why.
+
+_SIDES = ("TOP", "BOTTOM")
+# Flags by which platformio.ini may have another wiring; settings of tests have no value.
+_FLAG = re.compile(r"-D\s*OHMSKIN_(\w+)=(\S+)")
+
+
+def build(board: str, flags: str, place: Path) -> Path:
+    """Build the firmware with these flags below `place`, whatever wiring platformio.ini has.
+
+    :raises RuntimeError: it does not compile, and why.
     """
-    variables = {
-        "PLATFORMIO_BUILD_DIR": str(place),
-        "PLATFORMIO_BUILD_FLAGS": flags,
-        "PLATFORMIO_CORE_DIR": str(ROOT / ".pio" / "core"),
-    }
+    project, built = place / "platformio.ini", place / "build"  # PlatformIO empties the latter
+    project.write_text(_FLAG.sub("", (ROOT / "platformio.ini").read_text()))
+    variables = {"PLATFORMIO_BUILD_DIR": str(built), "PLATFORMIO_BUILD_FLAGS": flags}
+    done = _pio("run", "-s", "-c", str(project), "-e", board, **variables)
+    if done.returncode:
+        raise RuntimeError(f"the firmware does not compile with {flags}:\n{done.stdout}")
+    return built / board / "firmware.elf"
+
+
+def _pio(*command: str, **variables: str) -> "subprocess.CompletedProcess[str]":
+    """Run PlatformIO for this project; its output and its messages are `stdout`."""
+    environment = {"PLATFORMIO_CORE_DIR": str(ROOT / ".pio" / "core")} | os.environ | variables
     pio = Path(sys.executable).parent / "pio"
-    command = [str(pio), "run", "-s", "-d", str(ROOT), "-e", board]
-    subprocess.run(
-        command,
-        env=os.environ | variables,
-        check=True,
+    return subprocess.run(
+        [str(pio), *command, "-d", str(ROOT)],
+        env=environment,
+        check=False,
         text=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    return place / board / "firmware.elf"
+
+
+def of_platformio_ini(board: str) -> tuple[PinMap, int]:
+    """The wiring that platformio.ini has for a board, and the number of it in `hello`."""
+    said = _pio("project", "config", "--json-output").stdout
+    flags = dict(dict(json.loads(said))[f"env:{board}"])["build_flags"]
+    told, usual = dict(_FLAG.findall(" ".join(flags))), DEFAULT[board]
+
+    def numbers(name: str, otherwise: tuple[int, ...]) -> tuple[int, ...]:
+        return tuple(map(int, told[name].split(","))) if name in told else otherwise
+
+    (top,), (bottom,) = (numbers(f"DRIVE_{s}_PIN", (usual.drive[n],)) for n, s in enumerate(_SIDES))
+    (top_ohm,), (bottom_ohm,) = (numbers(f"REF_{side}_OHM", (30_000,)) for side in _SIDES)
+    wiring = PinMap(
+        numbers("ROW_PINS", usual.rows),
+        numbers("COLUMN_PINS", usual.columns),
+        (top, bottom),
+        numbers("SENSE_INPUTS", usual.sense),
+        (top_ohm, bottom_ohm),
+    )
+    has_own_pins = any(name.endswith(("_PIN", "_PINS", "_INPUTS")) for name in told)
+    return wiring, wiring.crc if has_own_pins else 0
+
+
+def told_by(elf: Path) -> tuple[tuple[int, ...], tuple[int, int]]:
+    """What the firmware tells simulators: pins and sense inputs, and reference resistors [ohm]."""
+    section = ".ohmskin.wiring=/dev/stdout"
+    command = ["avr-objcopy", "--dump-section", section, str(elf), "/dev/null"]
+    done = subprocess.run(command, check=False, capture_output=True)
+    if done.returncode:
+        raise RuntimeError(f"{elf} does not tell its wiring: run 'make firmware'")
+    table = done.stdout
+    return tuple(table[:-8]), struct.unpack("<II", table[-8:])

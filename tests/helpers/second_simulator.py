@@ -9,6 +9,7 @@ from typing import Any
 from unittest.mock import patch
 
 from lockstep import LockstepSim, elf_of
+from pin_maps import pins_option, told_by
 from places import ROOT
 
 FOLDER = ROOT / "firmware" / "second_sim"
@@ -24,8 +25,11 @@ class SecondSim(LockstepSim):
     """A board with its HEX file; has the operations that firmware/second_sim/README.md lists."""
 
     def __init__(self, board: str, elf: Path | None = None, pins: str = "") -> None:
+        """pins: a wiring; else it is that which the firmware tells."""
+        elf = elf or elf_of(board)
+        pins = pins or pins_option(board, told_by(elf)[0])
         with patch("ohmskin.emulate.simavr.PROGRAM", FOLDER / "second_sim.js"):
-            super().__init__(board, (elf or elf_of(board)).with_suffix(".hex"), pins=pins)
+            super().__init__(board, elf.with_suffix(".hex"), pins=pins)
 
 
 class PicoSim(LockstepSim):
