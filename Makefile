@@ -33,7 +33,7 @@ BENCHMARKS := $(addprefix bench-,firmware import host estimators tables fingers 
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-host pins demo test check docs format firmware pico wheel test-firmware test-arduino-gcc check-firmware sim \
+.PHONY: help setup setup-host pins demo test check docs format firmware pico wheel test-firmware test-arduino-gcc test-wiring check-firmware sim \
         test-host test-world test-lerobot fuzz chart stability ablate far experiments clean distclean $(BENCHMARKS)
 
 help: ## list the targets
@@ -103,6 +103,10 @@ test-firmware: setup ## unit tests of the firmware: on this machine and in simul
 
 test-arduino-gcc: setup sim ## test the firmware as built with avr-gcc 7.3, which Arduino's users have
 	$(ONE_THREAD) tools/test_arduino_gcc.sh
+
+test-wiring: setup sim ## test the wiring that platformio.ini has: all cells, in the simulators
+	$(BIN)/pio run --silent -e uno -e megaatmega2560
+	$(ONE_THREAD) $(BIN)/pytest --quiet --capture=no -rfEs tests/firmware/test_wiring.py
 
 check-firmware: setup ## cppcheck
 	$(BIN)/pio check -e uno --fail-on-defect low --fail-on-defect medium --fail-on-defect high

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.driver import PtyServer
 from ohmskin.emulate.simavr import PROGRAM
 from ohmskin.emulate.urls import emulated
+from pin_maps import DEFAULT, told_by
 from ports import USB_IDS, Attach, Serve
 from studies.__main__ import app as studies
 
@@ -42,6 +44,9 @@ settings.load_profile("repeatable")
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("simavr") and not (PROGRAM.exists() and elf_of("uno").exists()):
         pytest.skip("needs 'make firmware sim'")
+    own = not item.get_closest_marker("simavr") or item.get_closest_marker("any_wiring")
+    if not own and (other := _wired_otherwise()):
+        pytest.skip(f"needs the wiring of docs/build.md: platformio.ini has another for {other}")
     if item.get_closest_marker("ngspice") and not shutil.which("ngspice"):
         _is_missing("ngspice", "ngspice")
     if item.get_closest_marker("browser") and not shutil.which("chromium"):
@@ -53,6 +58,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
             pytest.skip("needs 'make pico'")
         if not second_simulator.is_installed("rp2040js"):
             _is_missing("rp2040js", "npm")
+
+
+@cache
+def _wired_otherwise() -> str:
+    """The boards whose built firmware has not the wiring, or the references, of docs/build.md."""
+    usual = {board: (wiring.numbers, wiring.ref_ohm) for board, wiring in DEFAULT.items()}
+    return ", ".join(board for board in usual if told_by(elf_of(board)) != usual[board])
 
 
 def _is_missing(program: str, package: str) -> None:
