@@ -4,6 +4,7 @@
 import pkgutil
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from runpy import run_path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ import ohmskin
 from command_line import python
 from lockstep import Rig
 from ohmskin.cli.main import app
+from pin_maps import DEFAULT
 from places import ROOT
 
 DOCS = ROOT / "docs"
@@ -153,6 +155,19 @@ def test_both_pages_have_the_same_wiring() -> None:
     }
     assert len(rows["README.md"]) == 7
     assert rows["README.md"] == rows["docs/build.md"]
+
+
+def test_the_example_of_another_wiring_is_in_platformio_ini_and_has_its_number() -> None:
+    page = (DOCS / "wiring.md").read_text()
+    [example] = re.findall(r"^    \[env:uno\]\n(?:    .*\n)+", page, re.MULTILINE)
+    section = [line.strip() for line in example.splitlines() if "-DOHMSKIN" not in line]
+    ini = re.sub(r"^;.*\n", "", (ROOT / "platformio.ini").read_text(), flags=re.MULTILINE)
+    assert "\n".join(section) in ini
+    told = dict(re.findall(r"-DOHMSKIN_(\w+)=(\S+)", example))
+    assert told.keys() == {"ROW_PINS", "REF_TOP_OHM", "REF_BOTTOM_OHM"}
+    wired = replace(DEFAULT["uno"], rows=tuple(map(int, told["ROW_PINS"].split(","))))
+    assert f"wiring another one, 0x{wired.crc:04X}; " in page
+    assert f"{told['REF_TOP_OHM']} Ohm top, {told['REF_BOTTOM_OHM']} Ohm bottom" in page
 
 
 def loaded(name: str) -> SimpleNamespace:
