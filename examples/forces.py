@@ -4,9 +4,10 @@
 A line is "1.23 +- 0.10 N at (2.0, 5.0)", with the standard deviation of the force. Where that is
 larger than the force, the line is "uncertain at (2.0, 5.0)".
 
-Without hardware, with a calibration from presses that are made up:
+Without hardware, with presses of six cells of the emulated skin:
 
-    ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json --indenter-mm2 80
+    ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json \
+        --indenter-mm2 80 --wires 100,200 --leads 80
     python examples/forces.py "emulator://8x8?scene=moving" skin.json
 """
 

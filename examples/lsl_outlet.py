@@ -2,9 +2,11 @@
 """Forces as a stream of the Lab Streaming Layer: python lsl_outlet.py PORT CALIBRATION [SECONDS]
 
 One channel a cell, in newtons, each sample at the time of the middle of its scan; NaN where a cell
-has no force. Needs `pip install pylsl`. Without hardware, with made-up presses:
+has no force. Needs `pip install pylsl`. Without hardware, with presses of six cells of the
+emulated skin:
 
-    ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json --indenter-mm2 80
+    ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json \
+        --indenter-mm2 80 --wires 100,200 --leads 80
     python examples/lsl_outlet.py "emulator://8x8?scene=moving" skin.json
 """
 

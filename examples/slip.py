@@ -4,10 +4,11 @@
 A thing that begins to slip makes the force tremble, too fast for scans of the whole skin. So the
 skin is read twice, for a second each: as it is, and where it is touched alone.
 
-Without hardware, with a fingertip whose force trembles by 5 % at 200 Hz (shown as 8 %: the scene's
-conductance goes with a power of the force, and the made-up presses teach a straight line):
+Without hardware, with a fingertip whose force trembles by 5 % at 200 Hz, and presses of six cells
+of the emulated skin:
 
-    ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json --indenter-mm2 80
+    ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json \
+        --indenter-mm2 80 --wires 100,200 --leads 80
     python examples/slip.py "emulator://8x8?scene=slip&begin=0&speed=0" skin.json slip.png
 """
 

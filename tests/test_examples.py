@@ -119,16 +119,29 @@ def test_slip_shows_what_only_a_region_is_fast_enough_for(
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_made_up_presses_make_a_calibration(tmp_path: Path, run: Run) -> None:
+def test_presses_of_an_emulated_skin_make_a_calibration_that_is_near_the_truth(
+    tmp_path: Path, run: Run
+) -> None:
     path, table = tmp_path / "skin.json", str(EXAMPLES / "presses.csv")
-    arguments = ("emulator://8x8", table, str(path), "--indenter-mm2", "80")
-    said = well(run("calibrate", "table", *arguments)).out
+    told = ("--indenter-mm2", "80", "--wires", "100,200", "--leads", "80")
+    said = well(run("calibrate", "table", "emulator://8x8", table, str(path), *told)).out
     assert re.search(
-        "64 of 64 cells take .* of all presses; its held-out error is 0.3[0-9] N", said
+        "64 of 64 cells take .* of all presses; its held-out error is 0.5[0-9] N", said
     )
     assert len(said.splitlines()) == 3  # no table of cells that have nothing of their own
     calibration = ohmskin.load_calibration(path)
     assert (calibration.rows, calibration.columns, calibration.unit_id) == (8, 8, 0)
+    moving = "emulator://8x8?scene=moving&begin=0&speed=0"
+    lines = well(run("stream", moving, "--calibration", str(path), "--seconds", "1", "--json")).out
+    for line in lines.splitlines():  # the gains of other cells are other ones
+        shown, true_n = json.loads(line), np.sum(json.loads(line)["true_force_n"])
+        shown_n, std_n = (
+            sum(contact[name] for contact in shown["contacts"])
+            for name in ("force_n", "force_n_std")
+        )
+        assert shown_n == pytest.approx(true_n, rel=0.25)
+        assert abs(shown_n - true_n) < 2 * std_n
+        assert std_n < 0.3 * true_n
 
 
 def test_two_boards_have_one_clock() -> None:

@@ -40,7 +40,8 @@ def skin_json(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("skin") / "skin.json"
     presses = HERE.parents[1] / "examples" / "presses.csv"
     table = ("calibrate", "table", "emulator://8x8", presses, path, "--indenter-mm2", "80")
-    run("-m", "ohmskin", *table)
+    told = ("--wires", "100,200", "--leads", "80")
+    run("-m", "ohmskin", *table, *told)
     run("-m", "ohmskin", "skin", path, "--pitch-mm", "10,10")
     return path
 

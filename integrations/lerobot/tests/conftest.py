@@ -10,8 +10,9 @@ PRESSES = Path(__file__).parents[3] / "examples" / "presses.csv"
 
 
 def calibrated(path: Path, *more: str) -> str:
-    """A calibration of made-up presses."""
-    words = ("calibrate", "table", "emulator://8x8", PRESSES, path, "--indenter-mm2", "80", *more)
+    """A calibration by presses of an emulated skin."""
+    words = ("calibrate", "table", "emulator://8x8", PRESSES, path, "--indenter-mm2", "80")
+    words += ("--wires", "100,200", "--leads", "80", *more)
     subprocess.run([sys.executable, "-m", "ohmskin", *map(str, words)], check=True)
     return str(path)
 

@@ -27,6 +27,7 @@ from std_srvs.srv import Trigger
 HERE = Path(__file__).parents[1]
 URL = "emulator://8x8?scene=ghost&seed=1"
 TOUCHED = f"{URL}&begin=0"
+TOLD = ("--wires", "100,200", "--leads", "80")
 WATCHED_S = 60.0  # scans that are lost are counted for so long
 ENOUGH_S = 60.0  # a test waits so long for what comes at once, unless it never comes
 
@@ -36,7 +37,7 @@ def skin_json(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("skin") / "skin.json"
     presses = HERE.parents[1] / "examples" / "presses.csv"
     for words in (
-        ("calibrate", "table", "emulator://8x8", presses, path, "--indenter-mm2", "80"),
+        ("calibrate", "table", "emulator://8x8", presses, path, "--indenter-mm2", "80", *TOLD),
         ("skin", path, "--pitch-mm", "10,20", "--frame", "palm"),
     ):
         subprocess.run([sys.executable, "-m", "ohmskin", *map(str, words)], check=True)
