@@ -4,11 +4,12 @@
 Both draw Protobuf messages of the schema foxglove.PointCloud, so a skin is two clouds of points:
 
 =================  ===========================================================================
-/skin/points       a point a cell: x y z, normal, force [N] and its standard deviation [N]
+/skin/points       a point a cell: x y z, normal, force [N] and its standard deviation [N], colour
 /skin/contacts     a point a contact: the same of the contact
 =================  ===========================================================================
 
-Rerun draws neither foxglove.Grid nor foxglove.SceneUpdate, so neither is written.
+Rerun draws neither foxglove.Grid nor foxglove.SceneUpdate, so neither is written. Of a cloud it
+draws the places and the colours, which Foxglove takes, too, unless told to colour by `force`.
 """
 
 import time
@@ -31,6 +32,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import ohmskin
+from ohmskin.arrays import FULL_SCALE_N, shades
 from ohmskin.force.geometry import Geometry
 from ohmskin.force.tables import read_forces
 from ohmskin.record.export import Part
@@ -39,12 +41,22 @@ __all__ = ["POINTS", "add_clouds", "clouds", "serve"]
 
 POINTS, CONTACTS = "/skin/points", "/skin/contacts"
 NAMES = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "force", "force_std")
+COLOUR = ("red", "green", "blue", "alpha")
 # Forces are kept in steps of 1/1024 N, far below any deviation: digits of noise do not pack.
 STEPS_A_NEWTON = 1024
+# Red, green and blue of 0.1 N or less, of 1 N, and of 10 N or more: grey, yellow, red. Chosen: all
+# are seen on a dark ground, and the scale is that of `ohmskin stream`.
+_COLOURS = np.array([(90, 90, 90), (255, 220, 60), (220, 30, 30)])
 _FIELDS = [
     PackedElementField(name=name, offset=4 * index, type=PackedElementFieldNumericType.Float32)
     for index, name in enumerate(NAMES)
+] + [
+    PackedElementField(
+        name=name, offset=4 * len(NAMES) + index, type=PackedElementFieldNumericType.Uint8
+    )
+    for index, name in enumerate(COLOUR)
 ]
+_STRIDE = 4 * len(NAMES) + len(COLOUR)
 _HERE = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 
 
@@ -69,13 +81,18 @@ def clouds(scan: ohmskin.ForceScan) -> dict[str, PointCloud]:
 
 def _cloud(points: Any, time_ns: int, frame_id: str) -> PointCloud:
     points[:, -2:] = np.round(STEPS_A_NEWTON * points[:, -2:]) / STEPS_A_NEWTON
+    shade = shades(points[:, -2], FULL_SCALE_N)
+    colours = [np.interp(shade, (0, 0.5, 1), ramp) for ramp in _COLOURS.T]
+    packed = np.full((len(points), _STRIDE), 255, np.uint8)
+    packed[:, : 4 * len(NAMES)] = points.astype("<f4").view(np.uint8)
+    packed[:, 4 * len(NAMES) : -1] = np.transpose(colours)
     return PointCloud(
         timestamp=Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9),
         frame_id=frame_id,
         pose=_HERE,
-        point_stride=4 * len(NAMES),
+        point_stride=_STRIDE,
         fields=_FIELDS,
-        data=points.astype("<f4").tobytes(),
+        data=packed.tobytes(),
     )
 
 
@@ -117,17 +134,21 @@ def add_clouds(recording: Path, calibration: ohmskin.Calibration, out: Path) -> 
     return part.scans
 
 
-def serve(
-    skin: ohmskin.LiveSkin, port: int = 8765, started: Callable[[], object] = lambda: None
-) -> None:
+def serve(skin: ohmskin.LiveSkin, port: int = 8765, say: Callable[[str], object] = print) -> None:
     """Serve the clouds of a live skin to Foxglove, on loopback, until Ctrl-C.
 
     skin: of a calibration with a geometry; with ``every=False``, what is sent is always the newest.
-    started: is called when clients may connect. Raises RuntimeError if the port is taken.
+    say: is given a line when clients may connect, and one whenever scans begin or cease to come.
+
+    :raises RuntimeError: the port is taken.
+    :raises ValueError: the calibration is of another skin than that at the port.
     """
     import foxglove
 
-    server = foxglove.start_server(name="ohmskin", host="127.0.0.1", port=port)
+    try:
+        server = foxglove.start_server(name="ohmskin", host="127.0.0.1", port=port)
+    except RuntimeError as exc:
+        raise RuntimeError(f"port {port} is not free ({exc}): say another --ws-port") from exc
     channels = {topic: PointCloudChannel(topic) for topic in (POINTS, CONTACTS)}
     sent: ohmskin.ForceScan | None = None
 
@@ -142,8 +163,15 @@ def serve(
 
     skin.watchers.add(send)
     try:
-        started()
+        say(f"Foxglove: open ws://localhost:{port}")
+        said = ""
         while True:
+            if isinstance(skin.failure, ValueError):
+                raise skin.failure
+            now = "is being opened" if sent is None else "gives scans"
+            state = str(skin.failure or f"{skin.port} {now}")
+            if state != said:
+                say(said := state)
             time.sleep(0.2)
     except KeyboardInterrupt:
         pass

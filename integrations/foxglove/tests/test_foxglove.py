@@ -4,7 +4,10 @@
 import asyncio
 import json
 import os
+import re
 import runpy
+import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -23,7 +26,7 @@ from mcap_protobuf.decoder import DecoderFactory
 import ohmskin
 from ohmskin import live
 from ohmskin.record.recorder import Recorder
-from ohmskin_foxglove import CONTACTS, NAMES, POINTS, add_clouds
+from ohmskin_foxglove import COLOUR, CONTACTS, NAMES, POINTS, add_clouds
 
 HERE = Path(__file__).parents[1]
 URL = "emulator://8x8?scene=moving&seed=1&begin=0"
@@ -66,11 +69,19 @@ def both(recorded: Path, skin_json: Path, tmp_path_factory: pytest.TempPathFacto
 
 
 def points(cloud: object) -> np.ndarray:
-    """(points, 8), by the message's own fields."""
-    assert [(f.name, f.offset, f.type) for f in cloud.fields] == [
-        (name, 4 * index, 7) for index, name in enumerate(NAMES)
-    ]
-    return np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_stride // 4)
+    """(points, 12), by the message's own fields: 8 floats, and a colour of 4 bytes."""
+    kinds = {7: "<f4", 1: "u1"}
+    assert [f.name for f in cloud.fields] == [*NAMES, *COLOUR]
+    form = np.dtype(
+        {
+            "names": [f.name for f in cloud.fields],
+            "offsets": [f.offset for f in cloud.fields],
+            "formats": [kinds[f.type] for f in cloud.fields],
+            "itemsize": cloud.point_stride,
+        }
+    )
+    table = np.frombuffer(cloud.data, form)
+    return np.stack([table[f.name].astype(float) for f in cloud.fields], axis=-1)
 
 
 def test_a_recording_with_clouds_plays_as_before(
@@ -93,6 +104,11 @@ def test_a_recording_with_clouds_plays_as_before(
         assert table[:, 6] == pytest.approx(scan.force_n.ravel(), abs=1e-3)
         assert table[:, 7] == pytest.approx(scan.force_n_std.ravel(), abs=1e-3, rel=1e-5)
         assert points(contacts)[:, 6] == pytest.approx([c.force_n for c in scan.contacts], abs=1e-3)
+    shade = np.hypot(*(table[:, 9:11] - (220, 60)).T)  # from yellow, which is 1 N
+    assert (table[table[:, 6] <= 0.1][:, 8:11] == 90).all()
+    assert 0.5 < table[np.argmin(shade), 6] < 2
+    assert table[table[:, 6] > 5][:, 9].max(initial=0) < 120  # red has little green
+    assert (table[:, 11] == 255).all()
     assert table[3 * 8 + 5, :6] == pytest.approx([0.05, 0.03, 0, 0, 0, 1])
     run("-m", "ohmskin", "export", both, both.with_suffix(".csv"))
     times = both.stat().st_size / recorded.stat().st_size
@@ -116,6 +132,10 @@ def test_rerun_draws_the_clouds(both: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     printed = subprocess.run([program, "rrd", "print", "-v", out], capture_output=True, text=True)
     assert "Points3D:positions" in printed.stdout
+    printed = subprocess.run([program, "rrd", "print", "-vvv", out], capture_output=True, text=True)
+    colours = {int(each) for each in re.findall(r"\b\d{10}\b", printed.stdout)}
+    assert 0x5A5A5AFF in colours  # an untouched cell
+    assert len([each for each in colours if each >> 24 > 200 and each % 256 == 255]) > 20
     assert POINTS in printed.stdout
 
 
@@ -216,11 +236,63 @@ def test_the_rerun_logger_goes_on_when_it_is_plugged_20_times(
     assert out.stat().st_size > 0
 
 
+def said_by(*words: object, seconds: float = 20) -> str:
+    """What a program prints until it ends, or Ctrl-C ends it without a traceback."""
+    process = subprocess.Popen(
+        [sys.executable, *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    threading.Timer(seconds, process.send_signal, (signal.SIGINT,)).start()
+    said, _ = process.communicate(timeout=60)
+    assert "Traceback" not in said
+    return said
+
+
+LIVE = ("-m", "ohmskin_foxglove", "live", "--ws-port", "0")
+LOGGER = (HERE / "rerun_logger.py",)
+
+
+@pytest.mark.parametrize("program", [LIVE, LOGGER])
+def test_a_wrong_port_is_said(program: tuple, skin_json: Path, tmp_path: Path) -> None:
+    out = () if program == LIVE else (tmp_path / "a.rrd",)
+    lines = said_by(*program, "/dev/ttyNone", skin_json, *out, seconds=8).splitlines()
+    assert "no port /dev/ttyNone: 'ohmskin ports' lists the ports there are" in lines
+    if program == LOGGER:
+        assert lines[-1].startswith("0 scans logged; 0 missed on the line; 0 skipped")
+
+
+@pytest.mark.parametrize("program", [LIVE, LOGGER])
+def test_a_calibration_of_another_size_is_refused(
+    program: tuple, skin_json: Path, tmp_path: Path
+) -> None:
+    out = () if program == LIVE else (tmp_path / "a.rrd",)
+    said = said_by(*program, "emulator://6x6", skin_json, *out, seconds=50)
+    assert "this calibration is of a 8x8 skin, the board scans 6x6" in said.splitlines()[-1]
+
+
+def test_a_board_that_went_away_is_said(skin_json: Path) -> None:
+    said = said_by(*LIVE, f"{URL}&vanish=1", skin_json, seconds=12)
+    assert "is gone: is the board still plugged in?" in said
+    assert "gives scans" in said
+
+
+def test_a_port_that_is_taken_is_said(skin_json: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        said = said_by(*LIVE[:-1], port, URL, skin_json)
+    assert f"ohmskin-foxglove: port {port} is not free" in said
+    assert "say another --ws-port" in said
+
+
 def test_what_is_missing_is_said(recorded: Path, skin_json: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare.json"
     content = json.loads(skin_json.read_text())
     del content["geometry"]
     bare.write_text(json.dumps(content))
+    said = said_by(*LOGGER, URL, bare, tmp_path / "a.rrd")
+    assert said.startswith(f"rerun_logger: {bare}: nobody has said where the cells are: ohmskin")
     words = ("-m", "ohmskin_foxglove", "add", recorded, bare, tmp_path / "out.mcap")
     done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True)
     assert done.returncode == 1
