@@ -5,27 +5,51 @@ Without OUT, the viewer opens. A board that is unplugged and plugged again goes 
 (A recording with clouds, by ohmskin-foxglove add, opens in Rerun too.)
 """
 
+import subprocess
 import sys
+from contextlib import suppress
 
 import numpy as np
 import rerun as rr
 
 import ohmskin
 
-port, calibration, *out = sys.argv[1:]
-rr.init("ohmskin", spawn=not out)
+if len(sys.argv) not in (3, 4):
+    sys.exit(__doc__)
+port, path, *out = sys.argv[1:]
+try:
+    calibration = ohmskin.load_calibration(path)
+except ValueError as exc:
+    sys.exit(f"rerun_logger: {exc}")
+if calibration.geometry is None:
+    said = "nobody has said where the cells are: ohmskin skin"
+    sys.exit(f"rerun_logger: {path}: {said} {path} --pitch-mm 10,10")
+points = calibration.geometry.position_m.reshape(-1, 3)
+rr.init("ohmskin")
 if out:
     rr.save(out[0])
-with ohmskin.LiveSkin(port, calibration) as skin:
-    count = 0
-    while not skin.ended:
+else:  # rr.spawn would let other computers reach the viewer
+    subprocess.Popen([sys.executable, "-m", "rerun", "--bind", "127.0.0.1"], start_new_session=True)
+    rr.connect_grpc()
+count = logged = missed = 0
+said = ""
+with suppress(KeyboardInterrupt), ohmskin.LiveSkin(port, calibration) as skin:
+    while not skin.ended and not isinstance(skin.failure, ValueError):
+        state = str(skin.failure or f"{port} {'gives scans' if count else 'is being opened'}")
+        if state != said:
+            print(said := state, flush=True)
         count, scans = skin.since(count, timeout_s=1.0)
+        logged += len(scans)
         for scan in scans:
+            missed += scan.missed
             rr.set_time("time", timestamp=np.datetime64(scan.time_ns, "ns"))
-            points = scan.geometry.position_m.reshape(-1, 3)
             radii = 0.001 + 0.0005 * np.nan_to_num(scan.force_n).ravel()
             rr.log("skin/points", rr.Points3D(points, radii=radii))
             forces = scan.force_n.astype(np.float32)
             rr.log("skin/force", rr.Tensor(forces, dim_names=("row", "column")))
             for contact in scan.contacts:
                 rr.log(f"skin/contact/{contact.identity}", rr.Scalars(contact.force_n))
+late = skin.skipped + count - logged
+print(f"{logged} scans logged; {missed} missed on the line; {late} skipped by a busy machine")
+if isinstance(skin.failure, ValueError):  # such as a calibration of another skin
+    sys.exit(f"rerun_logger: {skin.failure}")
