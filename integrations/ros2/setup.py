@@ -4,6 +4,7 @@
 from setuptools import setup
 
 ROS = "rclpy[fastrtps]", "sensor-msgs", "std-srvs", "diagnostic-msgs"
+PYPI = [f"ros-kilted-{name}" for name in ROS]
 
 setup(
     name="ohmskin_ros",
@@ -15,9 +16,9 @@ setup(
         ("share/ohmskin_ros/launch", ["launch/skin.launch.py"]),
     ],
     install_requires=["setuptools", "numpy>=1.26", "ohmskin>=0.1"],
-    # ROS itself has these; PyPI has them for tests without ROS.
     extras_require={
-        "test": [*(f"ros-kilted-{name}" for name in ROS), "pytest>=8", "colcon-ros>=0.5"],
+        "pypi": PYPI,  # ROS itself has these
+        "test": [*PYPI, "pytest>=8", "colcon-ros>=0.5"],
     },
     zip_safe=True,
     license="Apache-2.0",

@@ -7,7 +7,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchDescription
 
-ARGUMENTS = {"port": "/dev/ttyACM0", "calibration": "skin.json", "frame_id": ""}
+ARGUMENTS = {"port": "/dev/ttyACM0", "calibration": "skin.json", "frame_id": "", "every": "true"}
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -31,6 +31,9 @@ from ohmskin.doctor.examine import examine
 from ohmskin.doctor.gather import gather
 from ohmskin_ros.messages import header, image, point_cloud
 
+# Diagnostics warn where more than this share of the last second's scans was not published. Chosen:
+# a pause of a busy machine now and then is no fault.
+SKIPPED_SHARE = 0.1
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -55,6 +58,8 @@ class SkinNode(Node):
         self.create_service(Trigger, "~/examine", self._examine)
         self.create_timer(1.0, self._diagnose)
         self.missed = self.published = 0
+        self._before = 0, 0  # published and skipped, at the last diagnosis
+        self._state = ""  # what the terminal was told last
         self._doctor: DiagnosticStatus | None = None  # what it has said last
         self.skin = ohmskin.LiveSkin(port, calibration, every=every)
         # A thread, so that a tare, which takes a second, holds up no scan.
@@ -112,6 +117,20 @@ class SkinNode(Node):
             level, said = DiagnosticStatus.ERROR, str(failure or "no scan yet")
         elif newest.estimate.message:
             level, said = DiagnosticStatus.WARN, newest.estimate.message
+        state = str(failure or ("is being opened" if newest is None else "scans come"))
+        if state != self._state and failure is None:
+            self.get_logger().info(f"{self.skin.port}: {state}")
+        elif state != self._state:
+            self.get_logger().error(state)
+        self._state = state
+        now = self.published, self.skin.skipped
+        published, skipped = (
+            count - before for count, before in zip(now, self._before, strict=True)
+        )
+        self._before = now
+        if level == DiagnosticStatus.OK and skipped > SKIPPED_SHARE * (published + skipped):
+            what = f"{skipped} of the last {published + skipped} scans were skipped"
+            level, said = DiagnosticStatus.WARN, f"{what}: this machine is too slow for all"
         counts = {
             "scans": self.published,
             "missed on the line": self.missed,

@@ -3,6 +3,7 @@
 
 import ast
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
@@ -204,3 +205,65 @@ def test_the_launch_file_is_python() -> None:
     assert "generate_launch_description" in {
         node.name for node in tree.body if isinstance(node, ast.FunctionDef)
     }
+
+
+def test_the_terminal_says_what_is_wrong(skin_json: Path) -> None:
+    """A board that goes away, and two ports that are wrong: each in a line, once."""
+    for port, said in (
+        (f"{TOUCHED}&vanish=5", "is gone: is the board still plugged in?"),
+        ("/dev/ttyNone", "no port /dev/ttyNone: 'ohmskin ports' lists the ports there are"),
+        ("emulator://6x6", "this calibration is of a 8x8 skin, the board scans 6x6"),
+    ):
+        parameters = ("-p", f"calibration:={skin_json}", "-p", f"port:='{port}'")
+        command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", *parameters]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        time.sleep(10)
+        process.send_signal(signal.SIGINT)
+        _, printed = process.communicate(timeout=30)
+        assert printed.count(said) == 1, printed
+        assert "Traceback" not in printed
+
+
+def test_scans_that_are_skipped_are_a_warning(
+    skin_json: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process, where an estimate takes as long as on a machine that is too slow."""
+    from ohmskin.force.reader import SkinReader
+    from ohmskin_ros.node import SkinNode
+
+    read = SkinReader.read
+
+    def slow(self: SkinReader, scan: object) -> object:
+        time.sleep(0.05)
+        return read(self, scan)
+
+    told = ["--ros-args", "-p", f"calibration:={skin_json}", "-p", f"port:='{TOUCHED}'"]
+    states = []
+    rclpy.init(args=told)
+    monkeypatch.setattr(SkinReader, "read", slow)
+    skin_node, watcher = SkinNode(), rclpy.create_node("watcher")
+    watcher.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda each: states.append(each.status[0]), 10
+    )
+    end_s = time.monotonic() + ENOUGH_S
+    while not any("were skipped: this machine is too slow" in each.message for each in states):
+        assert time.monotonic() < end_s
+        rclpy.spin_once(skin_node, timeout_sec=0.1)
+        rclpy.spin_once(watcher, timeout_sec=0.1)
+    warned = next(each for each in states if "were skipped" in each.message)
+    assert warned.level == DiagnosticStatus.WARN
+    skin_node.close()
+    watcher.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_the_example_listens(node: Callable) -> None:
+    node(TOUCHED)
+    command = [sys.executable, str(HERE / "listen.py")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    line = process.stdout.readline()
+    process.kill()
+    process.communicate()
+    found = re.fullmatch(r"([\d.]+) N in all, most of it on cell \((\d), (\d)\)\n", line)
+    assert 2 < float(found[1]) < 4
+    assert (int(found[2]), int(found[3])) in {(2, 2), (2, 5), (5, 2)}

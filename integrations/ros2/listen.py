@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Print the forces that the node publishes: python listen.py"""
+
+import numpy as np
+import rclpy
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import PointCloud2
+
+
+def show(cloud: PointCloud2) -> None:
+    cells = np.frombuffer(cloud.data, "<f4").reshape(cloud.height, cloud.width, -1)
+    force_n = np.nan_to_num(cells[..., 6])  # the fields' order is in the message, cloud.fields
+    row, column = np.unravel_index(force_n.argmax(), force_n.shape)
+    print(f"{force_n.sum():.2f} N in all, most of it on cell ({row}, {column})", flush=True)
+
+
+rclpy.init()
+node = rclpy.create_node("listener")
+node.create_subscription(PointCloud2, "/ohmskin/points", show, qos_profile_sensor_data)
+rclpy.spin(node)
