@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pad against forces that are known without it: a weight, and the motors of a gripper."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -94,6 +95,17 @@ def test_1_to_10_newtons_are_shown(
     rms = np.sqrt(np.mean((shown_n - on_skin_n) ** 2)) / on_skin_n.mean()
     print(f"figure: {calibration}: total force shown, rms over the mean: {100 * rms:.2f} %")
     assert rms < share
+
+
+def test_the_program_of_the_page_runs(
+    skin_json: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    [code] = re.findall(r"^```python\n(.*?)^```", (HERE / "README.md").read_text(), re.M | re.S)
+    monkeypatch.chdir(Path(skin_json).parent)
+    exec(compile(code, "README.md", "exec"), {})
+    true_n, shown_n = map(float, capsys.readouterr().out.split())
+    assert true_n == pytest.approx(0.3 * 9.81, rel=0.02)
+    assert shown_n == pytest.approx(true_n, rel=0.1)
 
 
 def test_what_is_missing_is_said(skin_json: str) -> None:
