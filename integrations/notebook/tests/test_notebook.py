@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The notebook, by a kernel of Jupyter: every cell runs, and the heat map is live."""
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
+import pytest
 from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
 
 NOTEBOOK = Path(__file__).parents[1] / "skin.ipynb"
+TABLE = Path(__file__).parents[3] / "examples" / "presses.csv"
 
 
 def test_every_cell_runs() -> None:
@@ -27,9 +33,25 @@ def test_every_cell_runs() -> None:
     assert len(set(updates)) > 10  # the finger moves
     _, _, plotted, arrays = (cell for cell in notebook.cells if cell.cell_type == "code")
     printed = "".join(out.text for out in plotted.outputs if out.output_type == "stream")
-    assert " N at [" in printed
+    assert re.search(r"1\d\.\d+ \+- [1-4]\.\d+ N at row \d\.\d, column \d\.\d\n", printed)
     shapes = arrays.outputs[0].data["text/plain"]
     assert "'force_n': (361, 8, 8)" in shapes or "'force_n': (360, 8, 8)" in shapes
+
+
+def test_with_a_board_only_the_port_changes(tmp_path: Path) -> None:
+    """The calibration is that of the folder; what is wrong with the port is said."""
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    first = next(cell for cell in notebook.cells if cell.cell_type == "code")
+    port = next(line for line in first.source.splitlines() if line.startswith("PORT ="))
+    client = NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}}, timeout=300)
+    first.source = first.source.replace(port, 'PORT = "/dev/ttyNone"')
+    with pytest.raises(CellExecutionError, match=r"skin\.json: cannot be read"):
+        client.execute()
+    words = ("calibrate", "table", "emulator://8x8", TABLE, tmp_path / "skin.json")
+    told = ("--indenter-mm2", "80", "--wires", "100,200", "--leads", "80")
+    subprocess.run([sys.executable, "-m", "ohmskin", *map(str, (*words, *told))], check=True)
+    with pytest.raises(CellExecutionError, match="no port /dev/ttyNone"):
+        client.execute()
 
 
 def test_it_is_kept_without_outputs() -> None:
