@@ -167,6 +167,7 @@ def test_the_example_of_another_wiring_is_in_platformio_ini_and_has_its_number()
     assert told.keys() == {"ROW_PINS", "REF_TOP_OHM", "REF_BOTTOM_OHM"}
     wired = replace(DEFAULT["uno"], rows=tuple(map(int, told["ROW_PINS"].split(","))))
     assert f"wiring another one, 0x{wired.crc:04X}; " in page
+    assert f"\n      {wired}\n" in page
     assert f"{told['REF_TOP_OHM']} Ohm top, {told['REF_BOTTOM_OHM']} Ohm bottom" in page
 
 

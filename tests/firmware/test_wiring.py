@@ -61,4 +61,5 @@ def test_every_cell_is_read(
     top, bottom = wiring.ref_ohm
     name = "avr8js" if simulator is SecondSim else "simavr"
     print(f"\n{board} in {name}: all {lines * lines} cells read right, each with its own resistor")
+    print(f"  {wiring}")
     print(f"  'ohmskin info' shows: wiring {says}; references {top} Ohm top, {bottom} Ohm bottom")

@@ -30,6 +30,13 @@ class PinMap:
     sense: tuple[int, ...]
     ref_ohm: tuple[int, int] = (30_000, 30_000)
 
+    def __str__(self) -> str:
+        rows, columns, drive, sense = (
+            ",".join(map(str, pins)) for pins in (self.rows, self.columns, self.drive, self.sense)
+        )
+        sense = "A" + sense.replace(",", ",A")
+        return f"rows {rows}; columns {columns}; drive {drive}; sense {sense}"
+
     @property
     def lines(self) -> int:
         """How many rows, and columns, its multiplexers can have."""
@@ -149,6 +156,8 @@ def of_platformio_ini(board: str) -> tuple[PinMap, int]:
     said = _pio("project", "config", "--json-output").stdout
     flags = dict(dict(json.loads(said))[f"env:{board}"])["build_flags"]
     told, usual = dict(_FLAG.findall(" ".join(flags))), DEFAULT[board]
+    odd = [f"OHMSKIN_{name}" for name in told if f"-DOHMSKIN_{name}=" not in WIDE.flags]
+    assert not odd, f"platformio.ini has flags that no board knows: {', '.join(odd)}"
 
     def numbers(name: str, otherwise: tuple[int, ...]) -> tuple[int, ...]:
         return tuple(map(int, told[name].split(","))) if name in told else otherwise
@@ -171,7 +180,7 @@ def told_by(elf: Path) -> tuple[tuple[int, ...], tuple[int, int]]:
     section = ".ohmskin.wiring=/dev/stdout"
     command = ["avr-objcopy", "--dump-section", section, str(elf), "/dev/null"]
     done = subprocess.run(command, check=False, capture_output=True)
-    if done.returncode:
+    if not done.stdout:  # objcopy may say so and return 0
         raise RuntimeError(f"{elf} does not tell its wiring: run 'make firmware'")
     table = done.stdout
     return tuple(table[:-8]), struct.unpack("<II", table[-8:])
