@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Print the forces that the node publishes: python listen.py"""
+"""Print the forces that the node publishes, until Ctrl-C: python listen.py"""
+
+from contextlib import suppress
 
 import numpy as np
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2
 
@@ -17,4 +20,5 @@ def show(cloud: PointCloud2) -> None:
 rclpy.init()
 node = rclpy.create_node("listener")
 node.create_subscription(PointCloud2, "/ohmskin/points", show, qos_profile_sensor_data)
-rclpy.spin(node)
+with suppress(KeyboardInterrupt, ExternalShutdownException):
+    rclpy.spin(node)

@@ -262,8 +262,9 @@ def test_the_example_listens(node: Callable) -> None:
     command = [sys.executable, str(HERE / "listen.py")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     line = process.stdout.readline()
-    process.kill()
-    process.communicate()
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=30)
+    assert "Traceback" not in said
     found = re.fullmatch(r"([\d.]+) N in all, most of it on cell \((\d), (\d)\)\n", line)
     assert 2 < float(found[1]) < 4
     assert (int(found[2]), int(found[3])) in {(2, 2), (2, 5), (5, 2)}
