@@ -2,9 +2,9 @@
 """A gripper squeezes a ball with 1 to 10 N: python squeeze.py CALIBRATION [PICTURE.png]
 
 Prints the force of the motors, that on the skin in the model, and what the skin shows. Without
-hardware, with presses of six cells of an emulated skin:
+hardware, with made-up presses:
 
-    ohmskin calibrate table "emulator://8x8" examples/presses.csv skin.json \
+    ohmskin calibrate table "emulator://8x8" integrations/mujoco/presses.csv skin.json \
         --indenter-mm2 80 --wires 100,200 --leads 80
     ohmskin skin skin.json --pitch-mm 10,10
     python integrations/mujoco/squeeze.py skin.json squeeze.png

@@ -34,18 +34,15 @@ def calibrated(path: Path, presses: Path) -> str:
 
 @pytest.fixture(scope="module")
 def skin_json(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """As the README makes one: presses of an emulated skin, whose law is a power."""
-    presses = HERE.parents[1] / "examples" / "presses.csv"
-    return calibrated(tmp_path_factory.mktemp("skin") / "skin.json", presses)
+    """As the README makes one, by presses on a line."""
+    return calibrated(tmp_path_factory.mktemp("skin") / "skin.json", HERE / "presses.csv")
 
 
 @pytest.fixture(scope="module")
-def line_json(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """By made-up presses on a line, 20 uS a newton."""
-    folder = tmp_path_factory.mktemp("line")
-    rows = [f"{at},{at},{force_n},{20e-6 * force_n}" for at in (2, 5) for force_n in (1, 2, 4, 8)]
-    (folder / "presses.csv").write_text("\n".join(["row,column,force_n,conductance", *rows]))
-    return calibrated(folder / "skin.json", folder / "presses.csv")
+def power_json(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """By presses of the emulated skin, whose law is a power."""
+    presses = HERE.parents[1] / "examples" / "presses.csv"
+    return calibrated(tmp_path_factory.mktemp("power") / "skin.json", presses)
 
 
 def resting(kg: float, x: float = 0.0, y: float = 0.0) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -56,10 +53,10 @@ def resting(kg: float, x: float = 0.0, y: float = 0.0) -> tuple[mujoco.MjModel, 
     return model, data
 
 
-def test_a_weight_lies_on_the_skin(line_json: str) -> None:
+def test_a_weight_lies_on_the_skin(skin_json: str) -> None:
     """m g by hand; at a place between taxels, which its centre must be."""
     model, data = resting(0.3, x=0.012, y=-0.007)
-    pad = Pad(model, "skin", ohmskin.load_calibration(line_json))
+    pad = Pad(model, "skin", ohmskin.load_calibration(skin_json))
     assert pad.spread_m == pytest.approx(0.01)
     true_n = pad.force_n(data)
     assert true_n.sum() == pytest.approx(0.3 * 9.81, rel=1e-3)
@@ -80,7 +77,7 @@ def test_nothing_touches_it(skin_json: str) -> None:
     assert not pad.read(data).contacts
 
 
-@pytest.mark.parametrize(("calibration", "share"), [("line_json", 0.02), ("skin_json", 0.04)])
+@pytest.mark.parametrize(("calibration", "share"), [("skin_json", 0.02), ("power_json", 0.04)])
 def test_1_to_10_newtons_are_shown(
     calibration: str, share: float, request: pytest.FixtureRequest
 ) -> None:
