@@ -19,10 +19,8 @@ struct {
 namespace ohmskin {
 namespace board {
 
-const uint16_t WIRING = wiring::CRC;
-const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM;
-const uint32_t REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
-const uint16_t SHORT_CODE = wiring::SHORT_CODE;
+const uint16_t WIRING = wiring::CRC, SHORT_CODE = wiring::SHORT_CODE;
+const uint32_t REF_TOP_OHM = wiring::REF_TOP_OHM, REF_BOTTOM_OHM = wiring::REF_BOTTOM_OHM;
 Scanner scanner;
 const uint8_t SLOTS_OF_NEW_LENGTH = 2;
 // An Uno takes 230 us for a reading by these calls. Scans that it cannot keep up with would lose
