@@ -129,6 +129,7 @@ def build(board: str, flags: str, place: Path) -> Path:
     :raises RuntimeError: it does not compile, and why.
     """
     project, built = place / "platformio.ini", place / "build"  # PlatformIO empties the latter
+    place.mkdir(exist_ok=True)
     project.write_text(_FLAG.sub("", (ROOT / "platformio.ini").read_text()))
     variables = {"PLATFORMIO_BUILD_DIR": str(built), "PLATFORMIO_BUILD_FLAGS": flags}
     done = _pio("run", "-s", "-c", str(project), "-e", board, **variables)
