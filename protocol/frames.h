@@ -250,7 +250,7 @@ struct __attribute__((packed)) SetRegion {
     uint16_t settle_us;  // [us] as in configure
     uint8_t mode;  // which readings a scan takes
     uint8_t whole_mode;  // which readings a whole scan in between takes
-    uint16_t whole_every;  // as in configure; the count goes on over a change of region
+    uint16_t whole_every;  // as in configure; the count goes on over a change of region, but a whole scan that is due lets one scan of the new region go first
 };
 static_assert(sizeof(SetRegion) == 18, "wire size");
 

@@ -114,7 +114,7 @@ void Device::count_scan() {
         if (before.idle_slots < IDLE_TO_CHANGE)
             slots = static_cast<uint16_t>(slots + IDLE_TO_CHANGE - before.idle_slots);
         take_change();
-        turns_.change(routes_.whole_every);
+        turns_.change();
     }
     whole_ = turns_.next_is_whole(routes_.whole_every);
     // The last slots before a scan have the length of its own (scanner.h).

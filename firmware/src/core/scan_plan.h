@@ -50,27 +50,35 @@ struct Routes {
 // scan, so that they need not tell each other.
 class Turns {
   public:
-    void begin() { left_ = 0; }
-    // The count goes on when another region comes, so that whole scans stay as frequent as asked
-    // however often the region changes.
-    void change(uint16_t every) {
-        if (left_ >= every)
-            left_ = every ? static_cast<uint16_t>(every - 1) : 0;
+    void begin() { left_ = 0, waited_ = false; }
+    // Another region comes. A whole scan that is due lets one scan of the new region go first,
+    // because a region is asked for where something moves. It does so once, so that whole scans
+    // come however often the region changes.
+    void change() {
+        if (left_ == 0 && !waited_) {
+            left_ = 1;
+            waited_ = true;
+        }
     }
-    // Whether the next scan is a whole one.
+    // Whether the next scan is a whole one. Each `every`-th is, 0: none.
     bool next_is_whole(uint16_t every) {
         if (every == 0)
             return false;
-        if (left_ == 0) {
+        // The count goes on when another region comes, but no longer than that one asks for.
+        if (left_ >= every)
             left_ = static_cast<uint16_t>(every - 1);
-            return true;
+        if (left_ != 0) {
+            left_--;
+            return false;
         }
-        left_--;
-        return false;
+        left_ = static_cast<uint16_t>(every - 1);
+        waited_ = false;
+        return true;
     }
 
   private:
-    uint16_t left_ = 0;  // scans of the region until the next whole one
+    uint16_t left_ = 0;    // scans of the region until the next whole one
+    bool waited_ = false;  // whether this whole one has let a region go first
 };
 
 namespace timing {

@@ -222,7 +222,7 @@ class Scanner {
     void take_change() {
         Bank *const bank = other_bank();
         bank_ = bank;
-        turns_.change(bank->whole_every);
+        turns_.change();
         alternates_ = true;
         changed_at_ = begun_;
         pauses_ = stopping_;

@@ -205,16 +205,39 @@ TEST(whole_scans_come_as_often_as_asked_whatever_changes) {
     uint16_t whole = 0;
     for (uint16_t scan = 0; scan < 300; scan++) {
         if (scan % 7 == 3)
-            turns.change(10);
+            turns.change();
         whole = static_cast<uint16_t>(whole + turns.next_is_whole(10));
     }
-    CHECK_EQ(30, whole);
-    turns.change(0);
+    CHECK(whole == 29 || whole == 30);
     CHECK(!turns.next_is_whole(0));
-    turns.change(2);
+    turns.begin();
+    CHECK(turns.next_is_whole(10));
+    CHECK(!turns.next_is_whole(2));  // nine were left, of which the new number takes one
     CHECK(turns.next_is_whole(2));
-    CHECK(!turns.next_is_whole(2));
-    CHECK(turns.next_is_whole(2));
+    CHECK(turns.next_is_whole(1));
+}
+
+TEST(a_whole_scan_that_is_due_lets_a_new_region_go_first_once) {
+    for (uint8_t every = 2; every < 5; every++) {
+        Turns turns;
+        turns.begin();
+        uint8_t region = 0, whole = 0;
+        for (uint8_t scan = 0; scan < 60; scan++) {
+            turns.change();
+            if (turns.next_is_whole(every)) {
+                CHECK(region >= 1 && region <= every);
+                region = 0;
+                whole++;
+            } else {
+                region++;
+            }
+        }
+        CHECK_EQ(60 / (every + 1), whole);
+    }
+    Turns turns;
+    turns.begin();
+    turns.change();
+    CHECK(turns.next_is_whole(1));  // all of them are whole
 }
 #endif
 

@@ -152,6 +152,7 @@ class EmulatedBoard:
         self._first = 0  # number of the first scan that is as long as the one in progress
         self._whole = False  # whether the scan in progress is a whole one
         self._until_whole = 0  # how many scans come before the next whole one
+        self._waited = False  # whether that one has let a region go first
         self._started_s: float | None = None
         self._out = bytearray()
         self._send_hello()
@@ -265,10 +266,14 @@ class EmulatedBoard:
 
     def _take_turn(self) -> None:
         """Decide which scan begins now: one of the region, or a whole one."""
-        before, self._plans = self._plan, self._next_plans
-        every = self.settings["whole_every"]
+        before, every = self._plan, self.settings["whole_every"]
+        if self._plans is not self._next_plans and not (self._until_whole or self._waited):
+            # A whole scan that is due lets one scan of a new region go first, as in the firmware.
+            self._until_whole, self._waited = 1, True
+        self._plans = self._next_plans
         self._until_whole = min(self._until_whole, max(every - 1, 0))
         self._whole = every > 0 and self._until_whole == 0
+        self._waited &= not self._whole
         self._until_whole = every - 1 if self._whole else max(self._until_whole - 1, 0)
         if self._plan.cycles != before.cycles and self._started_s is not None:
             # Times are counted from the first scan of this length: rounding does not add up then.
