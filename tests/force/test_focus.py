@@ -75,11 +75,11 @@ def test_a_contact_that_is_new_in_a_region_is_looked_at_by_a_whole_scan() -> Non
     focus.follow(touched((3, 4)), 1, whole)
     focus.follow(touched((3, 4)), 1, some)
     # Twice, where the board has said how long its scans take.
-    assert {(region.rows, region.mode) for region in asked} == {(range(2, 5), "quick")}
+    assert {(region.rows, region.mode) for region in asked} == {(range(2, 5), "near")}
     focus.follow(touched((3, 4), (3, 6)), 2, some)
     assert (asked[-1].rows, asked[-1].mode) == (None, "near")
     focus.follow(touched((3, 4), (3, 6)), 2, whole)
-    assert (asked[-1].columns, asked[-1].mode) == (range(3, 8), "quick")
+    assert (asked[-1].columns, asked[-1].mode) == (range(3, 8), "near")
 
 
 @pytest.mark.parametrize("settle_us", [0, 20])
@@ -101,7 +101,7 @@ def test_who_has_followed_contacts_leaves_the_board_as_it_was() -> None:
     before = skin.configure(rate_hz=50, settle_us=30)
     with Focus(skin) as focus:
         focus.follow(touched((3, 4)), 1, next(iter(skin)))
-        assert (skin.info.mode, skin.info.row_mask) == ("quick", 0b11100)
+        assert (skin.info.mode, skin.info.row_mask) == ("near", 0b11100)
     focus.follow(touched((5, 4)), 1, next(iter(skin)))
     assert skin.info == replace(before, scanning=1)
 
@@ -129,7 +129,7 @@ def test_a_region_follows_the_contacts_of_an_emulated_board() -> None:
                 break
         assert skin.device.stats.missed == 0
     assert {scan.mode for scan in whole} == {"near"}
-    assert {scan.mode for scan in small} == {"quick"}
+    assert {scan.mode for scan in small} == {"near"}
     assert len(small) > 5 * len(whole)
     # Whole scans still come often.
     times_s = 1e-6 * np.array([scan.time_us for scan in whole])

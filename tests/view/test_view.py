@@ -193,7 +193,7 @@ def test_the_board_follows_contacts_if_it_shall(tmp_path: Path) -> None:
         page.scan(lambda scan: scan["rate_hz"] < 91)
         assert not page.state["focus"]
     (path,) = tmp_path.glob("*.mcap")
-    assert {scan.mode for scan in load_recording(path).scans} == {"near", "quick"}
+    assert {scan.is_whole for scan in load_recording(path).scans} == {True, False}
 
 
 @pytest.mark.parametrize("calibrated", [True, False])

@@ -33,7 +33,7 @@ SPARE: Final = 1
 # longer. Chosen.
 MOST_SHARE: Final = 0.6
 # How regions are read, unless told: as fast as they are still accurate (docs/accuracy.md).
-FOLLOWING: Final = Region(mode="quick", whole_mode="near")
+FOLLOWING: Final = Region(mode="near", whole_mode="near")
 # Each so many-th scan is a whole one, until the board has said how long scans take.
 _FIRST_EVERY: Final = 20
 # A region is asked for at most so often: once more if the board's answer shows that whole scans
