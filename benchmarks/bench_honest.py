@@ -54,12 +54,9 @@ from studies.judge import STATED_STDS, Verdict, verdict
 from studies.rows import Progress, in_processes
 from studies.trials import (
     NOMINAL_WIRE_OHM,
-    Trial,
     finger_trial,
-    palm,
+    palm_trial,
     random_trial,
-    skin_at_rest,
-    trial_of,
 )
 from studies.unmodelled import lost
 
@@ -80,7 +77,6 @@ LONG_OHM = (10_000, 20_000, 41_000)
 CONSTANTS = (0.0, 0.3, 0.5, 0.8, 1.0)  # over Vdd: one of these for each skin
 LINE = 3  # the one far line that is off
 SEGMENT_TIMES, SHORT_OHM = 10.0, 20.0  # a damaged yarn; two neighbouring rows that touch
-PALM_SIEMENS = 2.5e-4
 UNTOLD_OHM = (500, 1000)
 LEAKS_OHM = (3_000_000, 1_000_000, 300_000)
 
@@ -125,13 +121,6 @@ def broken(ratio: Float, fault: str, number: int) -> Float:
     how = "near" if fault.endswith("near") else "off"
     lines = fault.removesuffix("_near").replace("line", "one row")
     return lost(ratio, f"{lines} {how}", CONSTANTS[number % len(CONSTANTS)], LINE)
-
-
-def palm_trial(rows: int, columns: int, frames: int, seed: int) -> Trial:
-    """A firm palm that comes and goes."""
-    random = np.random.default_rng(seed)
-    rest = skin_at_rest(rows, columns, random)
-    return trial_of(rest, palm(rest, frames, random, PALM_SIEMENS))
 
 
 def trial_of_scene(scene: Scene, frames: int) -> tuple[Skin, Float]:

@@ -65,6 +65,7 @@ OFF: Final[dict[str, float]] = {
     "prior.REACH_STDS": 1e-3,
     "prior.CLOSE_STDS": 1e-3,
     "prior.CROWDED_SHARE": np.inf,
+    "prior.PALM_SHARE": np.inf,
     "prior.SOFT_CORRELATION": 1.0,
     "sparse_fit.MAX_TOUCHES_PER_LINE": np.inf,
     "sparse_fit.DEMAND_STDS": 0.0,

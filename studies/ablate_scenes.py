@@ -31,6 +31,7 @@ from studies.trials import (
     Trial,
     finger_trial,
     jump_trial,
+    palm_trial,
     random_trial,
     reference_trial,
     rounded,
@@ -136,6 +137,7 @@ SCENES: Final = {
     "no_rest": Scene(partial(_simulated, partial(random_trial, 8, 8, 10), rest_told=False)),
     "fingers": Scene(partial(_simulated, partial(finger_trial, 8, 8))),
     "fingers_untold": Scene(partial(_simulated, partial(finger_trial, 8, 8), wires_told=False)),
+    "palms": Scene(partial(_simulated, partial(palm_trial, 8, 8), wires_told=False)),
     "random": Scene(partial(_simulated, partial(random_trial, 8, 8, 10))),
     "jump": Scene(partial(_simulated, partial(jump_trial, 8, 8, 10))),
     **{

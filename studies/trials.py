@@ -48,6 +48,7 @@ JUMP: Final = 1.5
 FINGER_CELLS: Final = 0.7  # standard deviation of a fingertip's pressure. Chosen: some 15 cells.
 FINGER_SIEMENS: Final = (5e-5, 5e-4)  # least and largest peak of a fingertip. Chosen.
 PALM_SHARE: Final = 0.6  # of the cells. Chosen.
+FIRM_SIEMENS: Final = 2.5e-4  # conductance in the middle of a firm palm. Chosen.
 FINGER_FRAMES: Final = 40  # a fingertip's way round its circle. Chosen: it moves in each frame.
 
 
@@ -251,6 +252,13 @@ def palm(rest: Skin, frames: int, random: np.random.Generator, peak_siemens: flo
     peak = peak * np.exp(0.3 * random.standard_normal(rest.shape))
     pressures = np.sin(np.pi * np.linspace(0.05, 0.95, frames))
     return [replace(rest, cell_siemens=rest.cell_siemens + at * peak) for at in pressures]
+
+
+def palm_trial(rows: int, columns: int, frames: int, seed: int) -> Trial:
+    """A firm palm that comes and goes."""
+    random = np.random.default_rng(seed)
+    rest = skin_at_rest(rows, columns, random)
+    return trial_of(rest, palm(rest, frames, random, FIRM_SIEMENS))
 
 
 def finger_trial(

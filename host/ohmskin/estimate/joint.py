@@ -193,6 +193,10 @@ class JointEstimator(Estimator):
         expected = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
         self._belief.expect_usual_leads(prior.is_crowded(start))
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
+        if expected is not prior and prior.is_palm(fit.log_cells):
+            # So many cells are not the few hard touches that the narrow prior would prefer. It
+            # knows better which cells are at rest.
+            fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, fit.log_cells)
         self._touches = prior.touches(fit.log_cells)
         message = self._doubt(expected, fit)
         if not (ports.fault or again) and ports.current.size >= LEAST_STAYING_PORTS:

@@ -40,6 +40,8 @@ HIDDEN_LOG: Final = 0.3
 CLEAR_LOG: Final = 0.1
 # Under fingertips a larger share of the cells is touched: the frame is crowded.
 CROWDED_SHARE: Final = 0.3
+# Under a palm, the touch is spread over as large a share of the cells.
+PALM_SHARE: Final = 0.45
 # Under soft fingertips, the rises of neighbours in a crowded frame correlate by more.
 SOFT_CORRELATION: Final = 0.5
 
@@ -141,6 +143,15 @@ class CellPrior:
         rise = (self.expected - log_ohm).reshape(shape)
         apart = np.concatenate([np.diff(rise, axis=axis).ravel() for axis in (0, 1)])
         return bool(apart @ apart < 2.0 * (1.0 - SOFT_CORRELATION) * rise.var() * apart.size)
+
+    def is_palm(self, log_ohm: Float) -> bool:
+        """Whether cells (RC,) rise as under a palm: nearly half of them, and all much alike.
+
+        Rises that are all alike on n cells have the square of their sum over the sum of their
+        squares of n. Where they differ, this is the number of cells that carry most of the sum.
+        """
+        rise = np.maximum(np.exp(-log_ohm) - np.exp(-self.expected), 0.0)
+        return bool(rise.sum() ** 2 > PALM_SHARE * rise.size * (rise @ rise))
 
     def for_soft_touches(self) -> "CellPrior":
         """The prior under soft fingertips, where rest is no more likely than a touch.
