@@ -15,7 +15,7 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ENUMS, MODES
-from studies.trials import Trial, bent_trial, jump_trial, random_trial
+from studies.trials import Trial, bent_trial, jump_trial, palm_trial, random_trial
 
 FRAMES = 50
 
@@ -65,8 +65,10 @@ def test_a_short_of_20_ohm_flags_most_frames_once_some_have_shown_it(method: str
         random_trial(4, 4, 4, FRAMES, 5),
         bent_trial(8, 8, 8, FRAMES, 3),
         jump_trial(8, 8, 8, FRAMES, 4),
+        palm_trial(8, 8, FRAMES, 6),
+        palm_trial(4, 4, FRAMES, 4),
     ],
-    ids=["dense", "small", "4x4", "bent", "jump"],
+    ids=["dense", "small", "4x4", "bent", "jump", "palm", "palm 4x4"],
 )
 def test_a_sound_skin_is_never_said_to_be_damaged(trial: Trial, mode: str, method: str) -> None:
     # One reading of each cell shows no noise, if nothing else has: it counts as that of a code.

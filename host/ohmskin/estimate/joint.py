@@ -193,13 +193,16 @@ class JointEstimator(Estimator):
         expected = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
         self._belief.expect_usual_leads(prior.is_crowded(start))
         fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
-        if expected is not prior and prior.is_palm(fit.log_cells):
+        is_palm = prior.is_palm(fit.log_cells)
+        if is_palm and expected is not prior:
             # So many cells are not the few hard touches that the narrow prior would prefer. It
             # knows better which cells are at rest.
             fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, fit.log_cells)
         self._touches = prior.touches(fit.log_cells)
         message = self._doubt(expected, fit)
-        if not (ports.fault or again) and ports.current.size >= LEAST_STAYING_PORTS:
+        # Nor does a palm tell of a fault: that so many cells are pressed is a surprise by itself.
+        tells = not (ports.fault or again or is_palm)
+        if tells and ports.current.size >= LEAST_STAYING_PORTS:
             surprise = MOST_SURPRISE if message else min(fit.surprise, MOST_SURPRISE)
             self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
         if not message and self._surprise > STAYING_SURPRISE:
