@@ -16,7 +16,7 @@ units_*                 median time of a frame's estimate over that of the unit 
                         one second of four overlapping presses. `random`: every frame touched anew,
                         so that a warm start is worth little. `finger`: soft fingertips that move,
                         wires not told; `_p99`: the 99th percentile over the median.
-ms_joint_16x16_finger_p99  99th percentile in milliseconds; a scan takes 26.6 ms.
+ms_joint_16x16_finger_p99  99th percentile in milliseconds; a scan takes 44 ms.
 error_*, ghost_*        random 8x8, up to 8 touches, cold: error of a pressed cell's conductance,
                         median and 90th percentile; largest conductance above the true one of a cell
                         that nothing presses, 95th percentile of the frames.

@@ -98,8 +98,8 @@ def open_all(
 ) -> Any:
     """Connect to several boards, all of these or none, and start scanning unless told otherwise.
 
-    urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of an Uno or a
-        Mega 2560. Such a port is skipped if no skin answers at it: it is another device. A skin
+    urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of a board that
+        the firmware is made for. Such a port is skipped if no skin answers at it: it is another device. A skin
         that cannot be used, because its port is busy or its firmware is of another version, is an
         error.
     calibrations: each a `Calibration` or a file; each board takes the one of its unit id.
