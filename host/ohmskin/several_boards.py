@@ -99,9 +99,9 @@ def open_all(
     """Connect to several boards, all of these or none, and start scanning unless told otherwise.
 
     urls: as `ohmskin.open` takes them; None: all serial ports whose USB id is that of a board that
-        the firmware is made for. Such a port is skipped if no skin answers at it: it is another device. A skin
-        that cannot be used, because its port is busy or its firmware is of another version, is an
-        error.
+        the firmware is made for. Such a port is skipped if no skin answers at it: it is another
+        device. A skin that cannot be used, because its port is busy or its firmware is of another
+        version, is an error.
     calibrations: each a `Calibration` or a file; each board takes the one of its unit id.
 
     >>> with open_all(["emulator://8x8?unit=1", "emulator://8x8?unit=2"]) as skins:

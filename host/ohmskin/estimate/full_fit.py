@@ -76,6 +76,7 @@ class FullFit:
     log_cells_std: their posterior deviation, (RC,).
     wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
     leads_log_std: the part of it that comes from the mean lead, (RC,).
+    wires: logs of the segments, then the leads [ohm], (w,).
     iterations: steps taken.
     message: why it did not converge, or empty.
     """
@@ -98,6 +99,7 @@ class FullFit:
         self._evaluate()
         self._minimise()
         self._conclude()
+        self.wires: Float = self._find_wires()  # now: a lesson would move the belief
 
     def _evaluate(self) -> None:
         """The circuit at the present state."""
@@ -219,8 +221,7 @@ class FullFit:
         self.log_cells = self.log_cells + share * cells_step
         self._mean_stds = self._mean_stds + share * stds_step
 
-    @cached_property
-    def wires(self) -> Float:
+    def _find_wires(self) -> Float:
         """Logs of the segments, and the leads, (w,): the mean, and how much each differs from it.
 
         In the fit, these differences were noise of covariance W W^T. In a residual whose whole

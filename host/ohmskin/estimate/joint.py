@@ -389,23 +389,23 @@ class JointEstimator(Estimator):
         if before is None:
             level = rest_level(ports.current, self.knowledge.ref_ohm)
             log_cells: Float = np.full(ports.current.size, -np.log(level))
-            alike, fit = self._fit_rest(ports, log_cells)
+            fit = self._fit_rest(ports, log_cells)
         else:
-            alike, fit = self._fit_rest(ports, before.expected, 1)
+            fit = self._fit_rest(ports, before.expected, 1)
         has_leaks = len(self._belief.means) > 3
         if not (has_leaks or fit.message) and leaks_of(fit)[0] > DAMP_GAIN:
-            alike, fit = self._expect_leaks(ports, fit)
+            fit = self._expect_leaks(ports, fit)
         log_cells = fit.log_cells
         self._rest_means = means = self._belief.means
         self._belief.fix_rest_wires()
         self._rest_wires_log_std = float(fit.wires_log_std.max())
         # Where wires hide even cells at rest, cells depend on the wires too strongly for slopes.
         hidden = self._rest_wires_log_std > REST_STD
-        by_means = alike.by_means if hidden else fit.cells_by_means()
+        by_means = np.zeros((log_cells.size, len(means))) if hidden else fit.cells_by_means()
         std = np.hypot(np.minimum(fit.log_cells_std, UNTOUCHED_STD), REST_STD)
         return CellPrior(log_cells, std, by_means, means)
 
-    def _expect_leaks(self, ports: PortReadings, fit: FullFit) -> tuple[CellPrior, FullFit]:
+    def _expect_leaks(self, ports: PortReadings, fit: FullFit) -> FullFit:
         """Find the leaks, and let the belief expect them. Returns `_fit_rest` with these leaks.
 
         fit: of the rest readings, without leaks.
@@ -417,16 +417,14 @@ class JointEstimator(Estimator):
             # would go back and forth.
             leaks_us = np.clip(leaks_us + 0.5 * more_us, 0.0, MOST_LEAK_US)
             self._belief.expect_leaks(leaks_us, np.full(2, LEAST_LEAK_US))
-            alike, fit = self._fit_rest(ports, fit.log_cells)
+            fit = self._fit_rest(ports, fit.log_cells)
             if fit.message:
                 break
         self._belief.expect_leaks(leaks_us, np.hypot(stds_us, LEAK_STD * leaks_us))
-        return alike, fit
+        return self._fit_rest(ports, fit.log_cells, 1)  # to expect leaks has reset the wires
 
-    def _fit_rest(
-        self, ports: PortReadings, log_cells: Float, fits: int = REST_FITS
-    ) -> tuple[CellPrior, FullFit]:
-        """Fits of the rest readings from these cells (RC,), and the prior of the last."""
+    def _fit_rest(self, ports: PortReadings, log_cells: Float, fits: int = REST_FITS) -> FullFit:
+        """The last of so many fits of the rest readings, from these cells (RC,)."""
         for _ in range(fits):
             self._belief.before_fit(log_cells, ports)
             alike = self._alike(log_cells.size, float(np.median(log_cells)), UNTOUCHED_STD)
@@ -434,7 +432,7 @@ class JointEstimator(Estimator):
             if fit.message:  # no skin gives these readings: more fits would only take more time
                 break
             log_cells = fit.log_cells
-        return alike, fit
+        return fit
 
 
 def leaks_of(fit: FullFit) -> tuple[float, Float, Float]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading follows the contacts: a region around them, and whole scans in between.
 
-A region of a few lines is read several times as often as the whole skin. It does not show a touch that
-is elsewhere, so whole scans come in between, `WHOLE_HZ` times a second. And a new touch in a region
-may be the ghost of touches outside, so the scan after it is a whole one.
+A region of a few lines is read several times as often as the whole skin. It does not show a touch
+that is elsewhere, so whole scans come in between, `WHOLE_HZ` times a second. And a new touch in a
+region may be the ghost of touches outside, so the scan after it is a whole one.
 """
 
 import threading
