@@ -334,20 +334,30 @@ class FullFit:
 
     def cells_by_means(self) -> Float:
         """How fitted cells follow the means, for the same readings, (RC, n): d log r / d mean."""
-        return self._cells_by(self._by_mean)
+        return self._cells_by(self._by_mean, self._by_cell)
 
     def cells_by_leaks(self) -> Float:
-        """How they follow the leaks between neighbouring rows, and columns, (RC, 2) [1/uS]."""
-        return self._cells_by(self._weighted(1e-6 * self._circuit.by_leaks()))
+        """How they follow the leaks between neighbouring rows, and columns, (RC, 2) [1/uS].
 
-    def _cells_by(self, slopes: Float) -> Float:
-        """How the fitted cells follow something else, for the same readings, (RC, k).
-
-        If it changes h by `slopes` (RC, k), the residual changes by -`slopes`, and the cells, of
-        all unknowns alone, follow to keep h as it is. With J the columns of the cells alone, their
-        u change by -J^T (N + J J^T)^-1 `slopes`.
+        The slopes are those of cells that are all alike. A cell that resists more than others also
+        follows leaks more: with slopes at the fitted cells, how cells differ by themselves would
+        look like leaks.
         """
-        by_cell = self._by_cell * self._cell_std
+        alike = np.full_like(self.log_cells, self.log_cells.mean())
+        circuit = self._belief.circuit(alike, self._means)
+        by_leaks = self._weighted(1e-6 * circuit.by_leaks())
+        return self._cells_by(by_leaks, self._weighted(circuit.by_cell()))
+
+    def _cells_by(self, slopes: Float, by_cell: Float) -> Float:
+        """How cells follow something else, for the same readings, (RC, k).
+
+        slopes, by_cell: dh by this, (RC, k), and by the log resistances of cells, (RC, RC).
+
+        The residual changes by -`slopes`, and the cells, of all unknowns alone, follow to keep h as
+        it is. With J the columns of the cells alone, their u change by
+        -J^T (N + J J^T)^-1 `slopes`.
+        """
+        by_cell = by_cell * self._cell_std
         factor = cholesky(gram(by_cell, onto=self._with_leads(self._own_lead_ohm)))
         return -self._cell_std[:, None] * (by_cell.T @ solve(factor, slopes))
 

@@ -57,9 +57,12 @@ REST_FITS: Final = 3
 # A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
 
-# A skin leaks if leaks explain so much of how cells differ at rest: it is the gain in twice the log
-# likelihood. Chosen: by chance, one sound skin of 270,000 gains as much, exp(-25 / 2) by the F
-# distribution.
+# Fits expect leaks if these explain so much of how cells differ at rest: it is the gain in twice
+# the log likelihood. Chosen: few sound skins gain as much by chance, and it costs them some time
+# and next to no accuracy. Leaks of 10 MOhm gain more, and neglected they spoil most frames.
+LEAK_GAIN: Final = 6.0
+# A skin is said to be damp if leaks explain so much. Chosen: by chance, one sound skin of 270,000
+# gains as much, exp(-25 / 2) by the F distribution.
 DAMP_GAIN: Final = 25.0
 # Fits of the leaks, each from the one before. Chosen: the last one moves the leaks by less than
 # their deviation.
@@ -67,6 +70,9 @@ LEAK_FITS: Final = 8
 # The largest leak at each crossing, and one that is too small to matter [uS]. Chosen: 10 kOhm, as
 # of a wet skin, and a gigohm.
 MOST_LEAK_US, LEAST_LEAK_US = 100.0, 1e-3
+# Cells at rest are taken anew if a leak has moved by more, or by 10 %. Chosen: 200 MOhm, which no
+# reading shows.
+LEAK_MOVE_US: Final = 5e-3
 # Standard deviation of a leak, as a share of it: leaks differ from crossing to crossing, and become
 # less while the skin dries. Chosen.
 LEAK_STD: Final = 0.2
@@ -109,6 +115,7 @@ class JointEstimator(Estimator):
         # The part of a cell's log deviation at rest that comes from the wires; the largest of all
         # cells.
         self._rest_wires_log_std = 0.0
+        self._is_damp = False
         self.reset()
 
     def wires(self) -> WireOhm:
@@ -119,11 +126,13 @@ class JointEstimator(Estimator):
     def leak_ohm(self) -> tuple[float, float] | None:
         """Resistance of the leaks between rows, and between columns, at each crossing [ohm].
 
-        None: the rest readings show no leaks, or nobody has told rest readings.
+        None: the rest readings do not show leaks for sure, or nobody has told rest readings.
         """
         self.rest()
+        if not self._is_damp:
+            return None
         by_row, by_column = np.maximum(self._belief.leak_siemens(self._belief.means), 1e-9)
-        return (1 / float(by_row), 1 / float(by_column)) if len(self._belief.means) > 3 else None
+        return 1 / float(by_row), 1 / float(by_column)
 
     def wires_are(self) -> str:
         """Layers that were told are "known"; others are "assumed" until frames have taught them."""
@@ -353,7 +362,12 @@ class JointEstimator(Estimator):
         if not any(self._belief.far) and np.abs(means - self._rest_means)[:2].max() > FAR_LOG:
             return self._prior_by_rest(self._rest_ports, prior)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
-        least = [least_log, least_log, LEAST_LEAD_OHM, *(SEGMENT_STD * np.abs(means[3:]))]
+        least = [
+            least_log,
+            least_log,
+            LEAST_LEAD_OHM,
+            *np.maximum(SEGMENT_STD * np.abs(means[3:]), LEAK_MOVE_US),
+        ]
         if (np.abs(means - prior.means) > least).any():
             return prior.about(means)
         return prior
@@ -393,8 +407,11 @@ class JointEstimator(Estimator):
         else:
             fit = self._fit_rest(ports, before.expected, 1)
         has_leaks = len(self._belief.means) > 3
-        if not (has_leaks or fit.message) and leaks_of(fit)[0] > DAMP_GAIN:
-            fit = self._expect_leaks(ports, fit)
+        if not (has_leaks or fit.message):
+            gain = leaks_of(fit)[0]
+            self._is_damp = gain > DAMP_GAIN
+            if gain > LEAK_GAIN:
+                fit = self._expect_leaks(ports, fit)
         log_cells = fit.log_cells
         self._rest_means = means = self._belief.means
         self._belief.fix_rest_wires()
@@ -442,8 +459,8 @@ def leaks_of(fit: FullFit) -> tuple[float, Float, Float]:
     because these lines have one neighbour alone. So the leaks are found, by least squares, as those
     with which the cells at rest are most alike.
 
-    Returns three things: the gain in twice the log likelihood (0 where leaks would have to be
-    negative), the leaks, and their deviations, each (2,) [uS].
+    Returns three things: the gain in twice the log likelihood, which no negative leak counts for,
+    the leaks, and their deviations, each (2,) [uS].
     """
     off, by_leaks = fit.log_cells - fit.log_cells.mean(), fit.cells_by_leaks()
     by_leaks = by_leaks - by_leaks.mean(axis=0)
@@ -453,9 +470,10 @@ def leaks_of(fit: FullFit) -> tuple[float, Float, Float]:
     # `drift` keeps cells that differ by less than they drift from telling of leaks. Three numbers
     # are fitted: the mean and two leaks.
     square, drift, free = left @ left, off.size * REST_STD**2, max(off.size - 3, 0)
-    gain = free * float(np.log((off @ off + drift) / (square + drift)))
     stds_us = np.sqrt(covariance.diagonal() * (square + drift) / max(free, 1))
-    return gain if leaks_us.max() > 0 else 0.0, leaks_us, stds_us
+    left = off + by_leaks @ np.maximum(leaks_us, 0.0)
+    gain = free * float(np.log((off @ off + drift) / (left @ left + drift)))
+    return gain, leaks_us, stds_us
 
 
 class TouchEstimator(JointEstimator):

@@ -104,6 +104,9 @@ from ohmskin.estimate.prior import (
 FAR_LOG: Final = 0.3
 # A frame is fitted so often at most. Chosen: the time of a frame stays bounded.
 MOST_FITS: Final = 4
+# A leak of a fit may be this far below 0 [uS]. No leak is, but a limit at 0, of which slopes do not
+# know, would keep fits of small leaks from ending. Chosen: as much as 10 MOhm, the other way.
+LOWEST_LEAK_US: Final = -0.1
 
 
 class Lesson(NamedTuple):
@@ -298,7 +301,7 @@ class WireBelief(ABC):
         """From row to row, and from column to column, at each crossing, by these means (n,) [S]."""
         if len(means) == 3:
             return 0.0, 0.0
-        by_row, by_column = (1e-6 * max(leak, 0.0) for leak in means[3:].tolist())
+        by_row, by_column = (1e-6 * max(leak, LOWEST_LEAK_US) for leak in means[3:].tolist())
         return by_row, by_column
 
     @property
