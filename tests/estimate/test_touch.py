@@ -335,20 +335,20 @@ def test_the_belief_of_wires_is_of_two_kalman_filters() -> None:
             share * (own_covariance + np.outer(one - mean, one - mean))
             for share, own_covariance, one in zip(shares, covariances, means, strict=True)
         )
-    np.testing.assert_allclose(belief.mean, layers @ mean, rtol=1e-9)
+    np.testing.assert_allclose(belief.expected_wires, layers @ mean, rtol=1e-9)
     own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * mean[2]], (6, 6, 5))) ** 2
     whole = layers @ covariance @ layers.T + own
     root = belief.per_std(np.eye(17)[:, :12], np.eye(17)[:, 12:], np.zeros((17, 3)))
     np.testing.assert_allclose(root @ root.T, whole, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(root[:, -3:], belief.per_mean_std(layers), atol=1e-9)
-    np.testing.assert_allclose(belief.mean_std(), np.sqrt(covariance.diagonal()))
+    np.testing.assert_allclose(belief.means_std(), np.sqrt(covariance.diagonal()))
     away = 0.1 * random.normal(size=20)
     of_own = np.sqrt(np.diagonal(own)) * away[:-3]
     wires = belief.wires_off(away[-3:], of_own[:12], of_own[12:])
-    np.testing.assert_allclose(wires, belief.mean + root @ away, rtol=1e-9)
+    np.testing.assert_allclose(wires, belief.expected_wires + root @ away, rtol=1e-9)
     some = random.normal(size=(3, 17))
     moved = belief.moved_since(before, belief.per_mean_std(some @ layers))
-    np.testing.assert_allclose(moved, some @ (belief.mean - layers @ before), rtol=1e-9)
+    np.testing.assert_allclose(moved, some @ (belief.expected_wires - layers @ before), rtol=1e-9)
 
 
 def test_still_wires_are_known_better_than_wires_that_were_bent() -> None:
@@ -364,7 +364,7 @@ def test_still_wires_are_known_better_than_wires_that_were_bent() -> None:
         per_std = belief.per_mean_std(slopes)
         factor = np.linalg.cholesky(per_std @ per_std.T + np.eye(4))
         belief.take(Lesson(per_std, residual, factor))
-        stds.append(belief.mean_std()[:2].max())
+        stds.append(belief.means_std()[:2].max())
         errors.append(np.abs(belief.means - true)[:2].max())
     assert stds[19] < 0.07
     assert max(stds[20:]) > 1.7 * stds[19]

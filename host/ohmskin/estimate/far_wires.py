@@ -111,7 +111,7 @@ class MeasuredWires(WireBelief):
 
     def learned(self) -> WireOhm | None:
         """The means as the last frame has shown them, also if it had a fingertip on the skin."""
-        return None if self._known[0] is self._nominal else self._as_known()
+        return None if self._known.means is self._nominal else self._as_known()
 
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
         """Take the means from this frame, weighed against the frames before.
@@ -249,7 +249,7 @@ class MeasuredWires(WireBelief):
         most = np.diagonal(self._prior_covariance)
         variance[:2] += FADE_SHARE * (most - variance)[:2]  # a bend does not change leads
         self._means_before = self.means, variance
-        segments = self.segment_ohm(self.mean)
+        segments = self.segment_ohm(self.expected_wires)
         for layer in (0, 1):
             if self.far[layer]:
                 segments[layer] = self._segments_of(layer, circuit, ports, offset)

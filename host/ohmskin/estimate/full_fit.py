@@ -105,7 +105,7 @@ class FullFit:
         """The circuit at the present state."""
         self._means = self._belief.means_off(self._mean_stds)
         self._circuit = self._belief.circuit(self.log_cells, self._means)
-        series_ohm = self._ref_ohm + self._belief.leads_of_port * self._means[2]
+        series_ohm = self._ref_ohm + self._belief.lead_count * self._means[2]
         # A step may make the mean lead negative. Half of the references is far below what any port
         # has in series, and keeps the current finite.
         self._modelled = 1.0 / (self._circuit.port_ohm + max(series_ohm, 0.5 * self._ref_ohm))
@@ -138,9 +138,9 @@ class FullFit:
             self._by_lead = self._weighted(self._belief.leads_of_ports.copy())
             self._of_leads = gram(self._by_lead)
         self._by_cell = self._weighted(self._circuit.by_cell())
-        by_lead = np.full((self._modelled.size, 1), float(self._belief.leads_of_port))
+        by_lead = np.full((self._modelled.size, 1), float(self._belief.lead_count))
         by_means = [self._circuit.by_layers(), by_lead]
-        if len(self._mean_stds) > 3:
+        if self._belief.has_leaks:
             by_means.append(1e-6 * self._circuit.by_leaks())  # by uS
         by_mean = self._weighted(np.hstack(by_means))
         self._by_mean = by_mean + self._by_cell @ self._prior.by_means

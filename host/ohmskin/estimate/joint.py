@@ -46,7 +46,7 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.region_fit import RegionFit, WholeFrame
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_touches
-from ohmskin.estimate.wire_belief import FAR_LOG, MOST_FITS, LearnedWires, WireBelief
+from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, LearnedWires, WireBelief
 
 # The first two numbers are chosen. `make ablate` measures them with half, twice and none of each,
 # and the table "What each number earns" of docs/estimate.md says what came of it.
@@ -359,7 +359,8 @@ class JointEstimator(Estimator):
         # Cells at rest follow the layers by slopes, which hold for small moves only. After a larger
         # move, the rest readings are fitted again. (Readings at far ends hardly depend on the
         # layers.)
-        if not any(self._belief.far) and np.abs(means - self._rest_means)[:2].max() > FAR_LOG:
+        near = not any(self._belief.far)
+        if near and np.abs(means - self._rest_means)[:2].max() > LARGE_MOVE_LOG:
             return self._prior_by_rest(self._rest_ports, prior)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
         least = [
@@ -406,8 +407,7 @@ class JointEstimator(Estimator):
             fit = self._fit_rest(ports, log_cells)
         else:
             fit = self._fit_rest(ports, before.expected, 1)
-        has_leaks = len(self._belief.means) > 3
-        if not (has_leaks or fit.message):
+        if not (self._belief.has_leaks or fit.message):
             gain = leaks_of(fit)[0]
             self._is_damp = gain > DAMP_GAIN
             if gain > LEAK_GAIN:

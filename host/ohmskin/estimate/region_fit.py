@@ -51,7 +51,7 @@ class WholeFrame:
         is_soft = about.is_soft(log_cells, belief.shape)
         self.prior, self.belief = about.for_soft_touches() if is_soft else about, belief
         self.log_cells, self.log_cells_std = log_cells, log_cells_std
-        self.series_ohm = ref_ohm + belief.leads_of_port * belief.means[2]
+        self.series_ohm = ref_ohm + belief.lead_count * belief.means[2]
         siemens = np.exp(-log_cells).reshape(belief.shape)
         leak_siemens = belief.leak_siemens(belief.means)
         wires_ohm = np.exp(belief.means[:2])
@@ -85,7 +85,7 @@ class RegionFit:
         by_cell = currents * currents / net.cell_siemens * square
         by_cell[:, region] = 0.0
         of_cells = by_cell @ whole.prior.by_means
-        if belief.means.size > 3:
+        if belief.has_leaks:
             of_cells[:, 3:] += 1e-6 * square * net.by_leaks()[region]  # by uS
         by_wire = square * net.by_wires_of(region, currents, currents)
         self._by_wires = belief.per_std(by_wire, square * belief.leads_of_ports[region], of_cells)

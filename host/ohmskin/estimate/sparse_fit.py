@@ -263,7 +263,7 @@ class SparseFit:
 
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
         self.prior, self.belief = prior, belief
-        self.series_ohm = ref_ohm + belief.leads_of_port * prior.means[2]
+        self.series_ohm = ref_ohm + belief.lead_count * prior.means[2]
         self.most = most_touches(belief.shape)
         self.least_log_siemens = -prior.expected + TOUCHED_STDS * prior.std
         rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
@@ -285,15 +285,15 @@ class SparseFit:
         by_ohm = (self.current**2)[:, None]
         by_lead = by_ohm * belief.leads_of_ports
         of_cells = by_cell.T @ prior.by_means
-        if of_cells.shape[1] > 3:
+        if belief.has_leaks:
             of_cells[:, 3:] += 1e-6 * by_ohm * net.by_leaks()  # by uS
         per_std = belief.per_std(by_wire * by_ohm, by_lead, of_cells)
         self.model_variance = prior.std**2 @ (by_cell * by_cell)
         self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
         self.path_ohm = belief.believed_wires().path_ohm
-        *layer_std, lead_std_ohm = belief.mean_std()[:3].tolist()
+        *layer_std, lead_std_ohm = belief.means_std()[:3].tolist()
         wires_std = np.hypot(max(layer_std), SEGMENT_STD) * self.path_ohm
-        self.path_std_ohm = wires_std + belief.leads_of_port * lead_std_ohm
+        self.path_std_ohm = wires_std + belief.lead_count * lead_std_ohm
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
         """The touched cells of one frame; None if they are not few."""

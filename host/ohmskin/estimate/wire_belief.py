@@ -101,7 +101,7 @@ from ohmskin.estimate.prior import (
 
 # A frame is fitted again if its lesson moves the log of a mean by more. Chosen: 30 %, up to which
 # slopes are nearly right.
-FAR_LOG: Final = 0.3
+LARGE_MOVE_LOG: Final = 0.3
 # A frame is fitted so often at most. Chosen: the time of a frame stays bounded.
 MOST_FITS: Final = 4
 # A leak of a fit may be this far below 0 [uS]. No leak is, but a limit at 0, of which slopes do not
@@ -161,7 +161,9 @@ class _State:
 
 
 class WireBelief(ABC):
-    """Mean and covariance of the log wire resistances of a skin, whoever has shown them.
+    """Mean and covariance of the wires of a skin, and of its leaks, whoever has shown them.
+
+    Segments are in logs of ohms, leads in ohms, leaks in uS.
 
     shape: (rows, columns).
     far: whether rows, and columns, are sensed at their far ends.
@@ -179,7 +181,11 @@ class WireBelief(ABC):
         *,
         may_be_bent: bool = True,
     ) -> None:
-        """wires: what is known of them before any frame. may_be_bent: since they were measured."""
+        """The belief before any frame.
+
+        wires: what is known of them.
+        may_be_bent: whether the skin may have been bent since they were measured.
+        """
         self.shape, self.far = shape, far
         rows, columns = shape
         self._counts = rows * columns, rows * columns, rows + columns  # wires of each mean
@@ -206,6 +212,7 @@ class WireBelief(ABC):
         """Know that lines leak, by the rest readings, and forget what frames have shown.
 
         leaks_us: from row to row, and from column to column, at each crossing (2,) [uS].
+        stds_us: their deviations (2,) [uS].
         """
         self._nominal = np.concatenate([self._nominal[:3], leaks_us])
         stds = np.sqrt(np.diagonal(self._prior_covariance)[:3])
@@ -222,14 +229,12 @@ class WireBelief(ABC):
 
         A lead that nobody has told may be anything up to kilohms, and lessons must be able to show
         that. But most skins have a usual lead. Frames that tell nothing of the lead, as those of
-        fingertips do, are answered better if fits expect the usual one. So there are two states.
-        `_free` is what is known. `_usual` also has a prior of the usual lead. Where the known lead
-        is far from the usual one, this prior is as wide as they are apart: like that of a cell, it
-        has a heavy tail (`prior.CellPrior`). The deviations of answers always come from what is
-        known.
+        fingertips do, are answered better if fits expect the usual one. So there are two states:
+        `_known`, and `_usual`, which also has a prior of the usual lead. Where the known lead is
+        far from the usual one, this prior is as wide as they are apart: like that of a cell, it has
+        a heavy tail (`prior.CellPrior`). The deviations of answers always come from what is known.
         """
-        self._known = means, covariance
-        self._free = self._usual = _State(means, covariance)
+        self._known = self._usual = _State(means, covariance)
         away_ohm = abs(float(means[2] - self._nominal[2]))
         usual = max(self._usual_lead_std_ohm, away_ohm) ** -2.0 - 1.0 / self._prior_covariance[2, 2]
         if usual > 0.0:
@@ -243,7 +248,7 @@ class WireBelief(ABC):
 
     def expect_usual_leads(self, wanted: bool) -> None:
         """Let m and V be what fits expect under fingertips (wanted), or what is known."""
-        self._state = self._usual if wanted else self._free
+        self._state = self._usual if wanted else self._known
         self.means, self._root = self._state.means, self._state.root
 
     @abstractmethod
@@ -285,10 +290,10 @@ class WireBelief(ABC):
         return None if self._lesson_cells is None else self._as_known()
 
     def _as_known(self) -> WireOhm:
-        means, covariance = self._known
+        means, variance = self._known.means, self._known.covariance.diagonal()
         top, bottom = np.exp(means[:2]).tolist()
         lead = max(float(means[2]), 0.0)
-        return WireOhm(top, bottom, lead, *np.sqrt(covariance.diagonal()[:3]).tolist())
+        return WireOhm(top, bottom, lead, *np.sqrt(variance[:3]).tolist())
 
     def circuit(self, log_cells: Float, means: Float) -> PortCircuit:
         """The skin with these logs of its cells (RC,), and these means (n,), without its leads."""
@@ -299,14 +304,19 @@ class WireBelief(ABC):
 
     def leak_siemens(self, means: Float) -> tuple[float, float]:
         """From row to row, and from column to column, at each crossing, by these means (n,) [S]."""
-        if len(means) == 3:
+        if not self.has_leaks:
             return 0.0, 0.0
         by_row, by_column = (1e-6 * max(leak, LOWEST_LEAK_US) for leak in means[3:].tolist())
         return by_row, by_column
 
     @property
-    def leads_of_port(self) -> int:
-        """How many leads are in a reading of the near ends: 2, and 0 of far ends."""
+    def has_leaks(self) -> bool:
+        """Whether the means have two leaks after the lead."""
+        return len(self.means) > 3
+
+    @property
+    def lead_count(self) -> int:
+        """How many leads are in the readings of a port: those of its lines sensed at near ends."""
         return 2 - sum(self.far)
 
     def own_lead_ohm(self, means: Float) -> float:
@@ -314,12 +324,12 @@ class WireBelief(ABC):
         return SEGMENT_STD * abs(float(means[2]))
 
     @property
-    def mean(self) -> Float:
+    def expected_wires(self) -> Float:
         """Expected wires w, (W,)."""
         return np.repeat(self.means[:3], self._counts)
 
-    def mean_std(self) -> Float:
-        """Standard deviations of the means, (n,)."""
+    def means_std(self) -> Float:
+        """Standard deviations of `means`, (n,)."""
         return np.asarray(np.linalg.norm(self._root, axis=1))
 
     def odd_lead_ohm(self) -> float:
@@ -332,33 +342,33 @@ class WireBelief(ABC):
     @property
     def is_assumed(self) -> bool:
         """Whether nobody has told the layers, and frames have not taught them as well."""
-        return self.untold and float(self.mean_std()[:2].max()) >= LAYER_STD
+        return self.untold and float(self.means_std()[:2].max()) >= LAYER_STD
 
     def stds(self) -> WireStds:
         """How well the means are known."""
-        *layers, lead_std_ohm = self.mean_std()[:3].tolist()
+        *layers, lead_std_ohm = self.means_std()[:3].tolist()
         reach = UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS
         return WireStds(max(layers), self._known_lead_std_ohm / lead_std_ohm, reach)
 
     @property
     def _known_lead_std_ohm(self) -> float:
-        return float(self._known[1][2, 2] ** 0.5)
+        return float(self._known.covariance[2, 2] ** 0.5)
 
     def per_mean_std(self, slopes: Float) -> Float:
         """J L^T V^1/2 from slopes by the means, J L^T: one row a reading, one column a mean."""
         return slopes @ self._root
 
-    def per_std(self, by_segment: Float, by_lead: Float, of_cells: Float) -> Float:
+    def per_std(self, by_segment: Float, by_lead: Float, by_other: Float) -> Float:
         """J P^1/2: by what wires have of their own (W columns), by what they share (one a mean).
 
         by_segment, by_lead: J of the log segments (2RC columns) and of the leads (R+C).
-        of_cells: J of the means, by what else follows them: leaks, and the cells at rest.
+        by_other: J of the means (n columns), by what else follows them: leaks, cells at rest.
         """
         segments, wires = by_segment.shape[1], sum(self._counts)
         root = np.empty((len(by_segment), wires + len(self.means)))
         np.multiply(by_segment, SEGMENT_STD, out=root[:, :segments])
         np.multiply(by_lead, self.own_lead_ohm(self.means), out=root[:, segments:wires])
-        by_mean = of_cells.copy()
+        by_mean = by_other.copy()
         by_mean[:, :2] += by_segment.reshape(len(root), 2, -1).sum(axis=2)
         by_mean[:, 2] += by_lead.sum(axis=1)
         root[:, wires:] = self.per_mean_std(by_mean)
@@ -369,7 +379,7 @@ class WireBelief(ABC):
         return self.means + self._root @ mean_stds
 
     def wires_off(self, mean_stds: Float, segments_off: Float, leads_off: Float) -> Float:
-        """w (W,) of means that are so many deviations off (n,), and wires, about their means.
+        """w (W,): means `mean_stds` (n,) deviations off, and what wires differ from their means by.
 
         segments_off: of the logs of segments (2RC,). leads_off: of leads (R+C,) [ohm].
         """
@@ -388,7 +398,7 @@ class WireBelief(ABC):
 
     def segment_std(self) -> Float:
         """Standard deviation of the log of each segment, for (2, R, C)."""
-        return np.asarray(np.hypot(self.mean_std()[:2], SEGMENT_STD)[:, None, None])
+        return np.asarray(np.hypot(self.means_std()[:2], SEGMENT_STD)[:, None, None])
 
     def wires(self, wires: Float) -> SkinWires:
         """The wires of an answer whose fit found these, w (W,)."""
@@ -403,7 +413,7 @@ class WireBelief(ABC):
     def believed_wires(self) -> SkinWires:
         """The wires as believed, for answers whose fit took them so: made once for each belief."""
         if self._state.wires is None:
-            self._state.wires = wires = self.wires(self.mean)
+            self._state.wires = wires = self.wires(self.expected_wires)
             for array in (wires.segment_ohm, wires.segment_std_ohm):
                 array.setflags(write=False)  # they are in more than one estimate
         return self._state.wires
@@ -424,7 +434,8 @@ class LearnedWires(WireBelief):
         """Back to the nominal wires."""
         super().reset()
         self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
-        self._filters = self._before_lesson = [_Filter(*self._known)] * 2
+        known = _Filter(self._known.means, self._known.covariance)
+        self._filters = self._before_lesson = [known] * 2
 
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
         """Nothing: before its touches are known, a frame of near ends shows no wires."""
@@ -446,7 +457,7 @@ class LearnedWires(WireBelief):
         before = self.means
         self.take(fit.lesson, replace_last=again or not is_news)
         moved = np.abs(self.means - before)[:3]
-        return bool((moved > [FAR_LOG, FAR_LOG, USUAL_LEAD_STD_OHM]).any())
+        return bool((moved > [LARGE_MOVE_LOG, LARGE_MOVE_LOG, USUAL_LEAD_STD_OHM]).any())
 
     def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
         """One Kalman step.
