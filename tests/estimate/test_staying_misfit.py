@@ -10,7 +10,7 @@ from network import SkinCircuit  # tests/helpers
 from ohmskin.circuit.skin import Skin
 from ohmskin.circuit.small import cholesky, inverse_trace
 from ohmskin.estimate.base import Estimate
-from ohmskin.estimate.joint import STAYS
+from ohmskin.estimate.joint import STAYING_FAULT
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -52,7 +52,7 @@ def test_a_short_of_20_ohm_flags_most_frames_once_some_have_shown_it(method: str
     found = estimates(random_trial(8, 8, 8, FRAMES, 24001), method, short_ohm=20.0)
     late = found[20:]
     assert sum(one.converged for one in late) <= 6
-    assert sum(one.message == STAYS for one in late) >= 3  # that nothing else flags
+    assert sum(one.message == STAYING_FAULT for one in late) >= 3  # that nothing else flags
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])
@@ -74,7 +74,7 @@ def test_a_sound_skin_is_never_said_to_be_damaged(trial: Trial, mode: str, metho
     # One reading of each cell shows no noise, if nothing else has: it counts as that of a code.
     for noise_lsb in (0.3,) if mode == "quick" else (0.3, 3.0):
         found = estimates(trial, method, mode, noise_lsb=noise_lsb)
-        assert STAYS not in [one.message for one in found]
+        assert STAYING_FAULT not in [one.message for one in found]
 
 
 def test_the_trace_of_an_inverse() -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`joint`: every resistance of the skin at once, from one circuit for all readings.
 
-RC readings do not determine 3RC resistances. A prior does the rest, and the standard deviations of
-the answer say how much of it comes from the prior:
+RC readings do not determine 3RC resistances. A prior decides what they leave open, and the standard
+deviations of the answer say how much of it comes from the prior:
 
 - a cell is near its rest resistance, or touched. This is what removes ghosts that the readings do
   not exclude.
@@ -10,8 +10,8 @@ the answer say how much of it comes from the prior:
   the frames before have revealed.
 
 The maximum of the posterior is found by a few Gauss-Newton steps (`full_fit`). They begin at the
-few touches that `sparse_fit` finds. If no few touches lead to the readings, as under a fingertip,
-they begin at the cells that `matrix` finds.
+few touches that `sparse_fit` finds. If touches are many, as under a fingertip, they begin at the
+cells that `matrix` finds.
 
 `touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
 few touches. Where they do not explain the frame, its answer is that of `joint`. Without rest
@@ -67,9 +67,10 @@ DAMP_GAIN: Final = 25.0
 # Fits of the leaks, each from the one before. Chosen: the last one moves the leaks by less than
 # their deviation.
 LEAK_FITS: Final = 8
-# The largest leak at each crossing, and one that is too small to matter [uS]. Chosen: 10 kOhm, as
-# of a wet skin, and a gigohm.
-MOST_LEAK_US, LEAST_LEAK_US = 100.0, 1e-3
+# The largest leak at each crossing [uS]. Chosen: 10 kOhm, as of a wet skin.
+MOST_LEAK_US: Final = 100.0
+# Deviation of the leaks while they are being found [uS]. Chosen: a gigohm, so they stay as told.
+SEARCHED_LEAK_STD_US: Final = 1e-3
 # Cells at rest are taken anew if a leak has moved by more, or by 10 %. Chosen: 200 MOhm, which no
 # reading shows.
 LEAK_MOVE_US: Final = 5e-3
@@ -80,7 +81,9 @@ LEAK_STD: Final = 0.2
 # (`FullFit.surprise`) is above this. Chosen: on sound skins, dense touches have a surprise of up to
 # 1.
 STAYING_SURPRISE: Final = 1.2
-STAYS: Final = "other frames fit no touches: is a line shorted, or a yarn broken? ask the doctor"
+STAYING_FAULT: Final = (
+    "other frames fit no touches: is a line shorted, or a yarn broken? ask the doctor"
+)
 # Weight of the newest frame in this running mean.
 SURPRISE_SHARE: Final = 0.1
 # No frame enters the mean with more surprise, and a frame that nothing explains enters it with
@@ -90,15 +93,18 @@ MOST_SURPRISE: Final = 1.8
 LEAST_STAYING_PORTS: Final = 16
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
 # by less than their rounding.
-LEAST_LEAD_OHM: Final = 20.0
+LEAD_MOVE_OHM: Final = 20.0
 # A line that resists more than this from end to end is long [ohm]: to find where a fit starts, its
-# wire must not be neglected, and cells behind it may hide touches. Chosen: 8 segments of 3 kOhm.
-# From there on, a fit that starts at rest takes fewer steps.
+# wire must not be neglected, and it may hide touches behind it. Chosen: 8 segments of 3 kOhm. From
+# there on, a fit that starts at rest takes fewer steps.
 LONG_LINE_OHM: Final = 24e3
 
 
 class JointEstimator(Estimator):
-    """Gauss-Newton on all 3RC log resistances; learns the wires from frame to frame."""
+    """Finds all 3RC resistances: cells and means of wires by steps, single wires as noise.
+
+    It learns the wires from frame to frame.
+    """
 
     name: ClassVar[str] = "joint"
     takes_far: ClassVar[bool] = True
@@ -111,6 +117,10 @@ class JointEstimator(Estimator):
         wires, bent = knowledge.nominal_wire_ohm, knowledge.may_be_bent
         self._belief: WireBelief = believe(self._shape, wires, far, may_be_bent=bent)
         self._prior: CellPrior | None = None
+        # The rest readings as they were read, and the means (n,) at their last fit. Both come with
+        # the first prior, if rest readings are known.
+        self._rest_ports: PortReadings
+        self._rest_means: Float
         self._finder: SparseFit | None = None
         # The part of a cell's log deviation at rest that comes from the wires; the largest of all
         # cells.
@@ -143,7 +153,8 @@ class JointEstimator(Estimator):
     def reset(self) -> None:
         """Forget the frames before, and what they revealed of the wires."""
         super().reset()
-        self._cells_before: Float | None = None  # what `matrix` found in the last frame it started
+        # (R, C) [S]: what `matrix` found in the last frame that it was asked about.
+        self._cells_before: Float | None = None
         self._touches = 0  # touched cells in the last fit
         self._surprise = 0.0  # running mean of the surprise of the fits so far
         # The last whole frame, for regions of the frames after it; and the last region.
@@ -185,7 +196,8 @@ class JointEstimator(Estimator):
         """One fit of a frame, and whether the frame has to be fitted again.
 
         The fit is that of a few touches where these are the answer, as they may be for `touch`;
-        else it is the fit of all resistances. The belief about the wires learns from it.
+        else it is the fit of all resistances. The belief about the wires learns from it. A frame of
+        a region is fitted by `RegionFit` if this explains it; nothing is learned from it.
 
         again: the frame has been fitted before. What this fit teaches takes the place of what the
             last one has taught.
@@ -199,23 +211,25 @@ class JointEstimator(Estimator):
             return self._solution(ports, touched, self._belief.fault), again
         start = self._start(prior, ports, touches)
         self._belief.before_fit(start, ports)
-        expected = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
+        fit_prior = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
         self._belief.expect_usual_leads(prior.is_crowded(start))
-        fit = FullFit(expected, self._belief, self.knowledge.ref_ohm, ports, start)
+        fit = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
         is_palm = prior.is_palm(fit.log_cells)
-        if is_palm and expected is not prior:
+        if is_palm and fit_prior is not prior:
             # So many cells are not the few hard touches that the narrow prior would prefer. It
             # knows better which cells are at rest.
             fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, fit.log_cells)
         self._touches = prior.touches(fit.log_cells)
-        message = self._doubt(expected, fit)
-        # Nor does a palm tell of a fault: that so many cells are pressed is a surprise by itself.
-        tells = not (ports.fault or again or is_palm)
-        if tells and ports.current.size >= LEAST_STAYING_PORTS:
+        # A palm that was fitted again is doubted by the wide prior all the same. By the narrow one,
+        # cells at the edge of a palm would seem to conduct less than at rest.
+        message = self._doubt(fit_prior, fit)
+        # A palm tells of no fault: that so many cells are pressed is a surprise by itself.
+        tells_of_fault = not (ports.fault or again or is_palm)
+        if tells_of_fault and ports.current.size >= LEAST_STAYING_PORTS:
             surprise = MOST_SURPRISE if message else min(fit.surprise, MOST_SURPRISE)
             self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
         if not message and self._surprise > STAYING_SURPRISE:
-            message = STAYS
+            message = STAYING_FAULT
         # A crowded frame teaches nothing: other forces explain it as well as other wires do.
         if ports.fault or message or prior.is_crowded(fit.log_cells):
             again = False
@@ -265,17 +279,19 @@ class JointEstimator(Estimator):
     def _solution(
         self, ports: PortReadings, fit: FullFit | Touched | RegionFit, message: str = ""
     ) -> Solution:
+        """The answer that this fit gives. A whole frame is kept for the regions after it."""
         belief = self._belief
         if not isinstance(fit, RegionFit):
             self._whole = fit
-        full = fit if isinstance(fit, FullFit) else None
-        wires = belief.believed_wires() if full is None else belief.wires(full.wires)
+        if isinstance(fit, FullFit):
+            wires, surprise = belief.wires(fit.wires), fit.surprise
+        else:
+            wires, surprise = belief.believed_wires(), 0.0
         stds = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std, belief.stds()
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
         std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)
         # Where the model misses the readings by more than their noise, or by more than it expects
-        # to, it is wrong somewhere. So all deviations are widened by the ratio.
-        surprise = fit.surprise if isinstance(fit, FullFit) else 0.0
+        # to, it is wrong somewhere. So all variances are widened by the ratio.
         wider = max(1.0, fit.misfit, surprise) ** 0.5
         return Solution(
             cell_siemens=np.exp(-fit.log_cells).reshape(self._shape),
@@ -366,7 +382,7 @@ class JointEstimator(Estimator):
         least = [
             least_log,
             least_log,
-            LEAST_LEAD_OHM,
+            LEAD_MOVE_OHM,
             *np.maximum(SEGMENT_STD * np.abs(means[3:]), LEAK_MOVE_US),
         ]
         if (np.abs(means - prior.means) > least).any():
@@ -433,7 +449,7 @@ class JointEstimator(Estimator):
             # Only half of each step is taken: cells do not follow leaks linearly, and whole steps
             # would go back and forth.
             leaks_us = np.clip(leaks_us + 0.5 * more_us, 0.0, MOST_LEAK_US)
-            self._belief.expect_leaks(leaks_us, np.full(2, LEAST_LEAK_US))
+            self._belief.expect_leaks(leaks_us, np.full(2, SEARCHED_LEAK_STD_US))
             fit = self._fit_rest(ports, fit.log_cells)
             if fit.message:
                 break
@@ -464,13 +480,13 @@ def leaks_of(fit: FullFit) -> tuple[float, Float, Float]:
     """
     off, by_leaks = fit.log_cells - fit.log_cells.mean(), fit.cells_by_leaks()
     by_leaks = by_leaks - by_leaks.mean(axis=0)
-    covariance = np.linalg.pinv(by_leaks.T @ by_leaks)  # a single line leaks into none
-    leaks_us = -covariance @ by_leaks.T @ off
+    inverse = np.linalg.pinv(by_leaks.T @ by_leaks)  # a single line leaks into none
+    leaks_us = -inverse @ by_leaks.T @ off
     left = off + by_leaks @ leaks_us
     # `drift` keeps cells that differ by less than they drift from telling of leaks. Three numbers
     # are fitted: the mean and two leaks.
     square, drift, free = left @ left, off.size * REST_STD**2, max(off.size - 3, 0)
-    stds_us = np.sqrt(covariance.diagonal() * (square + drift) / max(free, 1))
+    stds_us = np.sqrt(inverse.diagonal() * (square + drift) / max(free, 1))
     left = off + by_leaks @ np.maximum(leaks_us, 0.0)
     gain = free * float(np.log((off @ off + drift) / (left @ left + drift)))
     return gain, leaks_us, stds_us
