@@ -3,24 +3,24 @@
 
 Symbols
 
-====== ============ ============================================================= ==========
-symbol shape        meaning                                                       unit
-====== ============ ============================================================= ==========
-n                   number of means: the logs of the mean segment of each layer,
-                    the mean lead, and two leaks if there are any (`wire_belief`)
-x      (RC + n,)    log resistances of cells, and the means                       log ohm,
-                                                                                  ohm, uS
-m      (RC + n,)    what the prior expects of x                                   as x
-P      (RC+n, RC+n) covariance of the prior
-u      (RC + n,)    deviations from the prior: x = m + P^1/2 u                    1
-y, h   (RC,)        measured and modelled port currents per Vdd, over their noise 1
-J      (RC, RC + n) dh / du                                                       1
-W      (RC, w)      dh / dw times s, where w are the log segments and the leads,  1
-                    and s the deviation of each from its mean
-N      (RC, RC)     covariance of y by its noise and by W: by all that x lacks    1
-S      (RC, RC)     covariance of y by all that is not certain, N + J J^T         1
-O      (RC, RC + n) J whitened: L^-1 J, with L L^T = S                            1
-====== ============ ============================================================= ==========
+====== ============== ============================================================= ==========
+symbol shape          meaning                                                       unit
+====== ============== ============================================================= ==========
+n                     number of means: the logs of the mean segment of each layer,
+                      the mean lead, and two leaks if there are any (`wire_belief`)
+x      (RC + n,)      log resistances of cells, and the means                       log ohm,
+                                                                                    ohm, uS
+m      (RC + n,)      what the prior expects of x                                   as x
+P      (RC+n, RC+n)   covariance of the prior
+u      (RC + n,)      deviations from the prior: x = m + P^1/2 u                    1
+y, h   (RC,)          measured and modelled port currents per Vdd, over their noise 1
+J      (RC, RC + n)   dh / du                                                       1
+W      (RC, 2RC+R+C)  dh / dw times s, where w are the log segments and the leads,  1
+                      and s the deviation of each from its mean
+N      (RC, RC)       covariance of y by its noise and by W: by all that x lacks    1
+S      (RC, RC)       covariance of y by all that is not certain, N + J J^T         1
+O      (RC, RC + n)   J whitened: L^-1 J, with L L^T = S                            1
+====== ============== ============================================================= ==========
 
 Minimised is (y - h)^T N^-1 (y - h) + |u|^2. The prior of the cells has tails, and P is that of a
 normal: so P of the cells is made anew for these tails at every step (`CellPrior.normal`). What each
@@ -61,9 +61,9 @@ from ohmskin.estimate.wire_belief import Lesson, WireBelief
 USUAL_ITERATIONS: Final = 12
 # A step turns back if its share along the step before is below this. Chosen.
 TURNED_SHARE: Final = -0.25
-# A fit with a larger chi-square per port after `USUAL_ITERATIONS` ends: no skin gives these
-# readings, and on large skins each step takes long. Chosen: in the tests, 140 of 16,400 fits had a
-# larger one after 12 steps, and none of them converged.
+# A fit ends after `USUAL_ITERATIONS` if its chi-square per port is larger than this: no skin gives
+# these readings, and on large skins each step takes long. Chosen: in the tests, 140 of 16,400 fits
+# had a larger one after 12 steps, and none of them converged.
 HOPELESS_MISFIT: Final = 100.0
 # Limits of a cell's log resistance [log ohm].
 _LEAST_LOG_OHM, _MOST_LOG_OHM = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)
@@ -76,7 +76,7 @@ class FullFit:
     log_cells_std: their posterior deviation, (RC,).
     wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
     leads_log_std: the part of it that comes from the mean lead, (RC,).
-    wires: logs of the segments, then the leads [ohm], (w,).
+    wires: logs of the segments, then the leads [ohm], (2RC + R+C,).
     iterations: steps taken.
     message: why it did not converge, or empty.
     """
@@ -89,7 +89,10 @@ class FullFit:
         ports: PortReadings,
         start: Float,
     ) -> None:
-        """Minimise from these log resistances of the cells, `start` (RC,)."""
+        """Minimise from these log resistances of the cells, `start` (RC,).
+
+        ref_ohm: both references in series [ohm].
+        """
         self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
         self._current, self._weight = ports.current.ravel(), 1.0 / ports.current_std.ravel()
         self.iterations, self.message = 0, ""
@@ -116,7 +119,8 @@ class FullFit:
     def _weighted(self, slopes: Float, scale: float = 1.0) -> Float:
         """Slopes of h from those of rho, (RC, ...), which are overwritten.
 
-        h = weight / (rho + ref), so dh / d rho is -weight times the modelled current squared.
+        h = weight / (rho + series): rho is the port resistance, series the references and leads. So
+        dh / d rho is -weight times the modelled current squared.
         """
         slopes *= (-scale * self._weight * self._modelled**2)[:, None]
         return slopes
@@ -138,12 +142,13 @@ class FullFit:
             self._by_lead = self._weighted(self._belief.leads_of_ports.copy())
             self._of_leads = gram(self._by_lead)
         self._by_cell = self._weighted(self._circuit.by_cell())
-        by_lead = np.full((self._modelled.size, 1), float(self._belief.lead_count))
-        by_means = [self._circuit.by_layers(), by_lead]
+        by_mean_lead = np.full((self._modelled.size, 1), float(self._belief.lead_count))
+        direct = [self._circuit.by_layers(), by_mean_lead]
         if self._belief.has_leaks:
-            by_means.append(1e-6 * self._circuit.by_leaks())  # by uS
-        by_mean = self._weighted(np.hstack(by_means))
-        self._by_mean = by_mean + self._by_cell @ self._prior.by_means
+            direct.append(1e-6 * self._circuit.by_leaks())  # by uS
+        # Cells at rest follow the means of the wires.
+        by_rest = self._by_cell @ self._prior.by_means
+        self._by_mean = self._weighted(np.hstack(direct)) + by_rest
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
         self._cell_std = np.sqrt(self._variance)
         self._slopes, self._factor = self._factorised(self._cell_std)
@@ -196,13 +201,14 @@ class FullFit:
 
         The columns of J are per deviation that the cells had at the last linearisation. The prior
         of the cells, a normal that follows the tail (`CellPrior.normal`), is that of the present
-        state: the slope of half its -2 log p is (x - centre) / present variance. So that the step
-        has this slope in it, u of a cell is the slope times the older deviation.
+        state: the slope of its -log p is (x - centre) / present variance. So that the step has this
+        slope in it, u of a cell is the slope times the older deviation.
         """
         cell_stds = (self.log_cells - self._centre) * self._cell_std / self._variance
         present = np.concatenate([cell_stds, self._mean_stds])
-        self._weighted_residual = solve(self._factor, self._residual + self._slopes @ present)
-        step = self._weighted_residual @ self._slopes - present
+        # S^-1 (y - h + J u), over the noise's deviation.
+        self._probable_noise = solve(self._factor, self._residual + self._slopes @ present)
+        step = self._probable_noise @ self._slopes - present
         readings_step = self._slopes @ step
         cells_step = step[: cell_stds.size]
         return step, float(max(np.abs(readings_step).max(), np.abs(cells_step).max()))
@@ -213,22 +219,22 @@ class FullFit:
         means_step = self._belief.means_off(stds_step) - self._belief.means
         # A cell that would leave its limits goes to the limit, and does not shorten the whole step.
         log_cells = self.log_cells + self._cell_std * step + self._prior.by_means @ means_step
-        cells_step = np.minimum(np.maximum(log_cells, _LEAST_LOG_OHM), _MOST_LOG_OHM)
-        cells_step -= self.log_cells
-        most = max(np.abs(cells_step).max(), np.abs(means_step[:2]).max(), 1e-9)
+        logs_step = np.minimum(np.maximum(log_cells, _LEAST_LOG_OHM), _MOST_LOG_OHM)
+        logs_step -= self.log_cells
+        most = max(np.abs(logs_step).max(), np.abs(means_step[:2]).max(), 1e-9)
         share = min(1.0, MAX_STEP_LOG / most)
         self._moved_log += share * most
-        self.log_cells = self.log_cells + share * cells_step
+        self.log_cells = self.log_cells + share * logs_step
         self._mean_stds = self._mean_stds + share * stds_step
 
     def _find_wires(self) -> Float:
-        """Logs of the segments, and the leads, (w,): the mean, and how much each differs from it.
+        """`wires`, (2RC + R+C,): their means, and how much each differs from its mean.
 
         In the fit, these differences were noise of covariance W W^T. In a residual whose whole
         covariance is S, the most probable differences, over s, are W^T S^-1 times the residual.
         """
-        segments_off = SEGMENT_STD * (self._weighted_residual @ self._by_segment)
-        leads_off = self._own_lead_ohm**2 * (self._weighted_residual @ self._by_lead)
+        segments_off = SEGMENT_STD * (self._probable_noise @ self._by_segment)
+        leads_off = self._own_lead_ohm**2 * (self._probable_noise @ self._by_lead)
         return self._belief.wires_off(self._mean_stds, segments_off, leads_off)
 
     @property
@@ -239,12 +245,12 @@ class FullFit:
         probable noise is S^-1 times the residual. The model is the measured current less this
         noise.
         """
-        return self._current - self._weighted_residual / self._weight
+        return self._current - self._probable_noise / self._weight
 
     @property
     def misfit(self) -> float:
         """Chi-square per port: the mean square of the most probable noise of the readings."""
-        return float(self._weighted_residual @ self._weighted_residual) / self._current.size
+        return float(self._probable_noise @ self._probable_noise) / self._current.size
 
     @cached_property
     def surprise(self) -> float:
@@ -266,7 +272,8 @@ class FullFit:
         element of O^T O, the share of c^2 that the readings have removed. The fit is linear: it
         finds O^T O times the true u. So a mean that is truly one deviation off moves the fitted u
         of a cell by the element (cell, mean) of O^T O: its part of the cell's deviation is c times
-        that. The layers are independent, and their parts are added as variances.
+        that. The u of the means are independent, so the parts of the first two are added as
+        variances.
 
         This holds for cells whose prior can be believed. Cells that may be touched unnoticed
         (`_find_unnoticed`) get a wider deviation c' instead of c. The fit itself stays as it is. S
@@ -276,7 +283,8 @@ class FullFit:
 
             J^T S'^-1 J = O^T O - O^T H (1 + H^T H)^-1 H^T O .
 
-        The last term is `correction`. After it, the columns of J of these cells grow by c' / c.
+        The last term is `correction`^T `correction`. After it, the columns of J of these cells grow
+        by c' / c.
         """
         cell_std, cells = self._cell_std, slice(self._cell_std.size)
         whitened = solve_lower(self._factor, self._slopes)

@@ -2,28 +2,28 @@
 """Which cells a frame shows to be touched, and how hard: what `touch` answers, and where `joint`
 starts.
 
-Symbols
+Symbols; m, x, s, J, W, P and S differ from those of `full_fit`
 
-====== ======== ================================================================== ==========
-symbol shape    meaning                                                            unit
-====== ======== ================================================================== ==========
-rho0   (RC,)    port resistance of the untouched skin                              ohm
-H      (RC, RC) voltage over cell e per current through port p                     ohm
-M      (RC, RC) voltage over cell e per current forced through cell f from outside ohm
-d      (k,)     what the touches add to the conductance of k cells                 S
-q      (k, RC)  current that the added conductance draws, per port current         1
-v      (RC, RC) voltage over cell e per current through port p, cells touched      ohm
-x      (k,)     log conductances of the k touched cells; all others are at rest    log S
-I      (RC,)    port currents per Vdd                                              S
-s      (RC,)    deviation of I by noise of readings, drift of cells at rest, wires S
-r      (RC,)    residual (I_read - I) / s, I_read the measured currents            1
-J      (k, RC)  dI / dx / s                                                        1
-A      (k, k)   J J^T and the precision of the prior of x                          1
-W      (m, n)   dI / dw / s P^1/2 at the m ports where wires matter; w are the log 1
-                segments and the leads, P is their covariance. n = 2RC + R+C and
-                the number of means (`wire_belief`)
-S      (m, m)   covariance of r at these ports by noise and wires, 1 + W W^T       1
-====== ======== ================================================================== ==========
+====== ============== ================================================================== ==========
+symbol shape          meaning                                                            unit
+====== ============== ================================================================== ==========
+rho0   (RC,)          port resistance of the untouched skin                              ohm
+H      (RC, RC)       voltage over cell e per current through port p                     ohm
+M      (RC, RC)       voltage over cell e per current forced through cell f from outside ohm
+d      (k,)           what the touches add to the conductance of k cells                 S
+q      (k, RC)        current that the added conductance draws, per port current         1
+v      (RC, RC)       voltage over cell e per current through port p, cells touched      ohm
+x      (k,)           log conductances of the k touched cells; all others are at rest    log S
+I      (RC,)          port currents per Vdd                                              S
+s      (RC,)          deviation of I by noise of readings, drift of cells at rest, wires S
+r      (RC,)          residual (I_read - I) / s, I_read the measured currents            1
+J      (k, RC)        dI / dx / s                                                        1
+A      (k, k)         J J^T and the precision of the prior of x                          1
+W      (m, 2RC+R+C+n) dI / dw / s P^1/2 at the m ports where wires matter; w are the log 1
+                      segments and the leads, P is their covariance, n the number of
+                      means (`wire_belief`)
+S      (m, m)         covariance of r at these ports by noise and wires, 1 + W W^T       1
+====== ============== ================================================================== ==========
 
 H, M and v are voltages per ampere, hence in ohms; in the code they are called `..._volt`.
 
@@ -257,8 +257,8 @@ class SparseFit:
     current: port currents of the untouched skin per Vdd, (RC,) [S].
     model_variance: variance of these currents by the drift of cells and by what is not known of
         wires, (RC,) [S^2].
-    path_ohm: wires and leads from each cell to the sensed ends of its lines, (RC,).
-    path_std_ohm: standard deviation of path_ohm, (RC,).
+    path_ohm: wires and leads from each cell to the sensed ends of its lines, (RC,) [ohm].
+    path_std_ohm: standard deviation of path_ohm, (RC,) [ohm].
     """
 
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
@@ -416,9 +416,10 @@ class FewTouches:
         missing_ohm = np.maximum(self._touched.port_ohm[asked] - target_ohm, 1e-9)
         added_ohm = slope / missing_ohm - cell_volt
         added_siemens = 1.0 / np.maximum(added_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
-        by_cell = np.zeros(skin.net.shape)
-        by_cell.ravel()[asked] = added_siemens
-        rival = np.maximum(by_cell.max(axis=1, keepdims=True), by_cell.max(axis=0)).ravel()[asked]
+        added_of_cells = np.zeros(skin.net.shape)
+        added_of_cells.ravel()[asked] = added_siemens
+        of_lines = added_of_cells.max(axis=1, keepdims=True), added_of_cells.max(axis=0)
+        rival = np.maximum(*of_lines).ravel()[asked]
         counts = added_siemens >= RIVAL_SHARE * rival
         return asked[counts], added_siemens[counts]
 
@@ -465,17 +466,17 @@ class FewTouches:
             if is_last:
                 break
         residual = self._residual[ports] - offset
-        weighted_residual = solve(factor, residual)
-        if residual @ weighted_residual > MAX_CHI2 * ports.size:
+        probable_noise = solve(factor, residual)
+        if residual @ probable_noise > MAX_CHI2 * ports.size:
             return None
         if self._residual[light].min(initial=0.0) < -DEMAND_STDS:
             return None
         # The residual has the covariance S, of which the noise of the readings has 1. So S^-1 times
-        # the residual is the most probable noise. The rest of the residual comes from wires that
-        # differ from what is believed, and belongs to the model. `offset` belongs to it as well,
-        # and is not yet in `_current`.
+        # the residual is the most probable noise. The remainder comes from wires that differ from
+        # what is believed, and belongs to the model. `offset` belongs to it as well, and is not yet
+        # in `_current`.
         modelled = self._current.copy()
-        modelled[ports] += (residual - weighted_residual + offset) * self._std[ports]
+        modelled[ports] += (residual - probable_noise + offset) * self._std[ports]
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1
         # A mean that is one deviation off moves x by its column of A^-1 J S^-1 W.
         by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, by_mean_std)
