@@ -267,7 +267,7 @@ class JointEstimator(Estimator):
             self._whole, self._region = WholeFrame(prior, self._belief, ref_ohm, *logs), None
         if self._region is None or not np.array_equal(self._region.region, ports.region):
             self._region = RegionFit(self._whole, ports.region)
-        return self._region if self._region.explains(ports) else None
+        return self._region if self._region.fit(ports) else None
 
     def _explained_by(self, touches: FewTouches) -> Touched | None:
         """The answer of these few touches, if they are all that the frame shows.

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a region: its cells alone are fitted, the others stay as the last whole frame has them.
 
-Symbols are those of `sparse_fit`. The k cells of the region are also its ports, by the same
-numbers. The skin of the last whole frame, g0, takes the place of the untouched one, so that d may
-be negative, which is exp(x) - g0:
+Symbols are those of `sparse_fit`, but for S. The k cells of the region are also its ports, by the
+same numbers. The skin of the last whole frame takes the place of the untouched one, with cells g0
+and ports rho0. So d = exp(x) - g0 may be negative:
 
     v = (1 + M_kk diag(d))^-1 H_kk ,   rho = rho0 - sum_k H d v ,   d rho / d g_e = -v_e^2 .
 
 Gauss-Newton steps on x minimise (I_read - I)^T S^-1 (I_read - I) and the prior of the cells, that
-of whole frames. S is the covariance of the readings, of the wires, and of what the last whole frame
-left open of the cells outside: these are noise here.
+of whole frames. S [S^2] is the covariance of I_read by noise of readings, by the wires, and by what
+the last whole frame left open of the cells outside: these are noise here.
 
-A whole frame takes milliseconds, and a region a part of one: a region is read a thousand times a
-second.
+A whole frame takes milliseconds, and a frame of a region about a tenth of that: a region may be
+read a thousand times a second.
 """
 
 from typing import Final
@@ -89,20 +89,25 @@ class RegionFit:
             of_cells[:, 3:] += 1e-6 * square * net.by_leaks()[region]  # by uS
         by_wire = square * net.by_wires_of(region, currents, currents)
         self._by_wires = belief.per_std(by_wire, square * belief.leads_of_ports[region], of_cells)
-        noise = np.hstack([self._by_wires, by_cell * whole.log_cells_std])
-        self._noise = gram(noise)
+        # S, but for the readings.
+        self._model_covariance = gram(np.hstack([self._by_wires, by_cell * whole.log_cells_std]))
         self._age = 0
 
-    def explains(self, ports: PortReadings) -> bool:
-        """Fit this frame; whether this region explains it."""
+    def fit(self, ports: PortReadings) -> bool:
+        """Fit this frame. Returns whether the fit explains it.
+
+        Only then are all attributes those of this frame.
+        """
         region, whole, x = self.region, self._whole, self._x
         measured = ports.current.ravel()[region]
-        system = self._noise.copy(order="F")
-        system.ravel(order="F")[:: region.size + 1] += ports.current_std.ravel()[region] ** 2
+        reading_variance = ports.current_std.ravel()[region] ** 2
+        system = self._model_covariance.copy(order="F")
+        system.ravel(order="F")[:: region.size + 1] += reading_variance
         factor = cholesky(system)
         for self.iterations in range(1, MOST_STEPS + 1):
             siemens = np.exp(x)
             added = siemens - self._before
+            # LAPACK's code, the last, is 0: as every cell conducts, the determinant is above 0.
             _, _, volt, _ = lapack.dgesv(self._eye + self._cell_volt * added, self._port_volt)
             rho = self._rho - added @ (self._port_volt * volt)
             current = 1.0 / (rho + whole.series_ohm)
@@ -122,13 +127,14 @@ class RegionFit:
                 break
         residual = residual - by_cell @ move
         self._x = x
+        # Written so that NaN is rejected, too.
         if not is_last or not residual @ residual <= MAX_CHI2 * region.size:
             return False
         whitened_means = solve_lower(factor, self._by_wires[:, -whole.belief.means.size :])
         covariance = solve_positive(system, self._eye.copy(order="F"))
         self._answer(covariance, covariance @ (by_cell.T @ whitened_means))
-        noise = ports.current_std.ravel()[region] ** 2
-        noise = noise * solve_lower(factor, residual, transposed=True)
+        # The most probable noise, as in `FullFit.modelled`: the variance times S^-1 r.
+        noise = reading_variance * solve_lower(factor, residual, transposed=True)
         self.modelled = ports.current.ravel().copy()
         self.modelled[region] -= noise
         return True
@@ -139,6 +145,7 @@ class RegionFit:
         self._age += 1
         self.log_cells = whole.log_cells.copy()
         self.log_cells[region] = -self._x
+        # A cell outside changes by the same share as the current of a port that is not read.
         self.log_cells_std = np.hypot(whole.log_cells_std, STALE_SHARE * self._age)
         self.log_cells_std[region] = np.sqrt(covariance.diagonal())
         self.wires_log_std, self.leads_log_std = np.zeros((2, self.log_cells.size))
