@@ -9,20 +9,24 @@ Symbols are those of `port_currents` and `port_noise`; K are the readings of a c
 Fewer than four readings do not show the offset o_k of each node, nor v. Both are taken from the
 last frame in which all was read; before there was one, from the rest readings. v is that of the
 rest readings if they have less, because lines that charge add to v in a frame. Where neither a
-frame nor rest was read, o_k is 0, and
+frame nor rest was read, o_k is 0, and of two or more readings,
 
-    v = max(2 s^2, median over cells of (I_1 - I_2)^2 / (R_1^-2 + R_2^-2) / 0.455) ,
+    v = median over cells of (I_1 - I_2)^2 / (R_1^-2 + R_2^-2) / 0.455 ,
 
-with I_1 and I_2 the currents that two of the readings show. v_I is not taken from another frame,
-because what is touched decides where lines charge. A single reading has v_I = v. Several show it as
-in `port_noise`:
+with I_1 and I_2 the currents that two of the readings show. In every case, v is at least 2 s^2. v_I
+is not taken from another frame, because what is touched decides where lines charge. A single
+reading has v_I = v. Several show it as in `port_noise`:
 
     v_cell = sum_k residual_k^2 / (|K| - 1) ,  v_I = v + STAYING_SHARE^2 max(0, v_cell - v) .
 
 If A and B alone are read, lines that charge add to A, and take less from B, which is read a slot
-later. Of what stays in the difference of both, the share `FIRST_SHARE` is A's, and the rest is B's.
-This is taken from the current, times max(0, 1 - `CLEAR_NOISES` v / v_cell), since a difference that
-is hardly above noise may be noise.
+later. Of what stays in the difference of both currents, I_A - I_B, the share `FIRST_SHARE` is what
+A has too much, and the remainder is what B lacks. I has R_A^2 / sum R_k^2 of the first in it, and
+lacks 1 - R_A^2 / sum R_k^2 of the second, so that
+
+    I -= (FIRST_SHARE - 1 + R_A^2 / sum R_k^2) max(0, 1 - CLEAR_NOISES v / v_cell) (I_A - I_B) .
+
+The factor max(...) is there because a difference that is hardly above noise may be noise.
 
 A port that was not read keeps its last current. Its deviation grows by `STALE_SHARE` of the current
 with each frame since then.
@@ -57,7 +61,7 @@ class Shown(NamedTuple):
 
     ports: its currents.
     offset_ratio: o_k of each reading (4,) [V/Vdd]; None: not all of the frame was read.
-    noise: v; None: the same.
+    noise: v [V^2/Vdd^2]; None: the same.
     """
 
     ports: PortCurrents

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is expected of a skin's resistances before a frame is read: of its cells, and of its wires.
 
-RC readings do not determine 3RC resistances; these numbers decide the rest. What is believed of the
-wires is corrected by what frames show of them (`wire_belief`).
+RC readings do not determine 3RC resistances; these numbers decide what they leave open. What is
+believed of the wires is corrected by what frames show of them (`wire_belief`).
 """
 
 from dataclasses import dataclass, replace
@@ -147,11 +147,13 @@ class CellPrior:
     def is_palm(self, log_ohm: Float) -> bool:
         """Whether cells (RC,) rise as under a palm: nearly half of them, and all much alike.
 
-        Rises that are all alike on n cells have the square of their sum over the sum of their
-        squares of n. Where they differ, this is the number of cells that carry most of the sum.
+        The rise is that of the conductance [S]. The square of the sum of all rises over the sum of
+        their squares is n if n cells rise alike and no other rises. Where rises differ, it is about
+        the number of cells that carry most of the sum.
         """
-        rise = np.maximum(np.exp(-log_ohm) - np.exp(-self.expected), 0.0)
-        return bool(rise.sum() ** 2 > PALM_SHARE * rise.size * (rise @ rise))
+        rise_siemens = np.maximum(np.exp(-log_ohm) - np.exp(-self.expected), 0.0)
+        squares = rise_siemens @ rise_siemens
+        return bool(rise_siemens.sum() ** 2 > PALM_SHARE * rise_siemens.size * squares)
 
     def for_soft_touches(self) -> "CellPrior":
         """The prior under soft fingertips, where rest is no more likely than a touch.
@@ -166,6 +168,8 @@ class CellPrior:
         self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)
     ) -> tuple[Float, Float]:
         """Mean and variance of the normal that has this prior's slope at these cells' logs.
+
+        log_ohm: of these cells (k,); cells: their numbers; by default all.
 
         A normal of mean m and variance V has the slope 2 (x - m) / V of -2 log p. With m `expected`
         and the distance D = x - m, the tail's slope is 2 / D: so V is D^2 there, and `std`^2 near
@@ -193,13 +197,13 @@ class WireStds(NamedTuple):
     """How well the means of a skin's wires are known.
 
     layer_std: standard deviation of the log of the mean segment, of the layer that is known less.
-    lead_reach: standard deviation of the mean lead, divided by the one with which frames are fitted
-        (under fingertips, fits expect usual leads).
+    lead_std_ratio: deviation of the mean lead as known, over the one that fits take (under
+        fingertips, fits expect usual leads).
     reach_stds: how many deviations away the upper limit is.
     """
 
     layer_std: float
-    lead_reach: float
+    lead_std_ratio: float
     reach_stds: float = REACH_STDS
 
 
@@ -208,16 +212,17 @@ def siemens_std(
     log_std: Float,
     wires_log_std: Float,
     leads_log_std: Float,
-    wires: "WireStds",
+    wires: WireStds,
     series_ohm: Float,
 ) -> tuple[Float, Float]:
     """Standard deviations of conductances, upwards and downwards [S], all (RC,).
 
+    log_siemens: logs of the conductances [log S].
     log_std: deviation of the log conductance, to first order.
     wires_log_std: the part of it that comes from the mean wires of the layers.
     leads_log_std: the part of it that comes from the mean lead.
     wires: how well the means are known.
-    series_ohm: leads and wires to the cell, and references.
+    series_ohm: leads and wires to the cell, and references [ohm].
 
     The error of the port current I = 1 / (r + series) is normal, and that of g = 1 / r is not. So
     the limits of k deviations are found for I, and carried over to g: each deviation stated is the
@@ -235,7 +240,7 @@ def siemens_std(
     # lead cannot be as much smaller, because none is below 0.
     reach = wires.reach_stds
     wider = np.expm1(reach * wires.layer_std) / (reach * wires.layer_std)
-    more = (wider**2 - 1.0) * wires_log_std**2 + (wires.lead_reach**2 - 1.0) * leads_log_std**2
+    more = (wider**2 - 1.0) * wires_log_std**2 + (wires.lead_std_ratio**2 - 1.0) * leads_log_std**2
     up_std = np.sqrt(log_std**2 + more)
     # d log I = - r / (r + series) d log r. So at the limits the current is (1 +- off) I, and the
     # whole resistance is (r + series) / (1 +- off). The cell's is this less `series_ohm`.
