@@ -74,7 +74,9 @@ def open(
     :raises ProtocolMismatch: the board was built from another protocol definition.
     :raises ProtocolError: the board says what cannot be.
     :raises RecordingError: the recording of a ``replay://`` port cannot be read.
-    :raises ValueError: the calibration cannot be read, or is of another unit or geometry.
+    :raises ValueError: the calibration cannot be read, or is of another unit, size or mode; with
+        `focus`: the board reads far ends.
+    :raises CommandRefused: with `focus`: the board has no regions, or is a recording.
     """
     # The file first: a board may take seconds to boot, and a wrong file is known at once.
     of_skin = None if calibration is None else loaded(calibration)

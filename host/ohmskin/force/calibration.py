@@ -176,7 +176,7 @@ class Calibration:
 
     @property
     def untouched(self) -> Rest:
-        """The rest in force: the tare, if there is one."""
+        """The rest that holds now: the tare, if there is one."""
         return self.rest if self.tare is None else self.tare
 
     def check(self, board: Hello, *, force: bool = False) -> None:

@@ -29,8 +29,8 @@ class Contact:
 
     identity: the same number for as long as the contact lasts, from 1.
     row, column: the centre, sum of F_e position_e / sum of F_e over the contact's cells e, in cell
-        units; 0 is the centre of the first cell.
-    force_n: sum of F_e [N].
+        units; 0 is the centre of the first cell. If the sum of F_e is 0, all cells count alike.
+    force_n: sum of F_e [N]. Without forces, F_e is the rise of the level (`ForceScan.contacts`).
     force_n_std: sum of the cells' standard deviations [N]. (Not the root of a sum of squares: the
         cells share wires, so that their errors may all have one sign.)
     cells: which cells it covers, (R, C).

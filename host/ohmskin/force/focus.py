@@ -34,7 +34,7 @@ SPARE: Final = 1
 MOST_SHARE: Final = 0.6
 # How regions are read, unless told: as fast as they are still accurate (docs/accuracy.md).
 FOLLOWING: Final = Region(mode="near", whole_mode="near")
-# Each so many-th scan is a whole one, until the board has said how long scans take.
+# One in so many scans is a whole one, until the board has said how long scans take.
 _FIRST_EVERY: Final = 20
 # A region is asked for at most so often: once more if the board's answer shows that whole scans
 # would come too often or too seldom.
@@ -62,13 +62,14 @@ class Focus(Closing):
         contacts, and `whole_every` is what `WHOLE_HZ` needs.
 
     :raises CommandRefused: the board has no regions, or is a recording.
+    :raises DeviceLost: the board does not answer.
     :raises ValueError: the board reads far ends, which no region shows.
     """
 
     def __init__(self, device: Device, like: Region = FOLLOWING) -> None:
         self._device, self._like = device, like
         self._lines: Lines | None = None
-        self._contacts = 0
+        self._contact_count = 0
         self._lock, self._closed = threading.Lock(), False
         self._before = Region.of(device.info)
         if device.info.reads_far:
@@ -77,13 +78,16 @@ class Focus(Closing):
         self._cell_s = self._whole_s = 0.0
         self._ask(None)
 
-    def follow(self, touched: Bool, contacts: int, scan: Scan) -> None:
+    def follow(self, touched: Bool, contact_count: int, scan: Scan) -> None:
         """Tell what a scan has shown: touched cells (R, C), and so many contacts.
 
         If another region is needed, this gives a command to the board. It takes some milliseconds,
         in which scans wait.
+
+        :raises CommandRefused: the board refuses the region, as where it is too much for the rate.
+        :raises DeviceLost: the board does not answer.
         """
-        is_new, self._contacts = contacts > self._contacts, contacts
+        is_new, self._contact_count = contact_count > self._contact_count, contact_count
         lines = wanted_lines(touched, self._lines)
         if is_new and not scan.is_whole:
             lines = None

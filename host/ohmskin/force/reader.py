@@ -52,14 +52,15 @@ _NAMED_CELLS: Final = 4
 class ForceScan(Scan):
     """A scan, and what it shows.
 
-    force_n: normal force of each cell, (R, C) [N]; NaN where `ForceModel.predict` gives none, and
-        everywhere without a calibration.
-    force_n_std: its standard deviation, (R, C) [N]; NaN where `predict` gives none.
-    contacts: touched cells that adjoin. Without a calibration, their force is the rise of their
-        conductance [S].
+    force_n: normal force of each cell, (R, C) [N]; NaN everywhere without forces, that is where
+        `SkinReader.has_forces` is False: no calibration, or a method that is not its own.
+    force_n_std: its standard deviation, (R, C) [N]; NaN without forces, and where
+        `ForceModel.predict` gives none.
+    contacts: touched cells that adjoin. Without forces, their force is the rise of the level [S; 1
+        for `voltage`].
     estimate: the estimate of which all this was made. Its ``message`` says why readings cannot be
         trusted.
-    geometry: where the cells are; None: the calibration does not say it.
+    geometry: where the cells are; None: no forces, or the calibration does not say it.
     """
 
     force_n: Float
@@ -108,7 +109,7 @@ class _SharedKnowledge:
     board: the board that scans the skin.
     calibration: gives newtons; None: there is none.
     rests: the rest of the calibration, or None where there is no calibration; after it, one rest
-        for each tare that was not undone. The last of them is the rest in force.
+        for each tare that was not undone. The last of them is the rest that holds now.
     last_estimator: the estimator of the reader that has read last. It is taken for the one that
         has seen the most touches, and so knows most of the wires.
     """
@@ -205,7 +206,7 @@ class SkinReader:
 
     @property
     def rest(self) -> Rest | Untouched | None:
-        """The rest in force; None where it is not known."""
+        """The rest that holds now; None where it is not known."""
         return self._shared.rests[-1]
 
     @property
@@ -221,7 +222,7 @@ class SkinReader:
         wires = (self._shared.last_estimator or self._estimator).wires()
         calibration = replace(self._shared.calibration, nominal_wire_ohm=wires)
         rest = self.rest
-        if isinstance(rest, Untouched):  # a tare of this session; a file has its level, too
+        if isinstance(rest, Untouched):  # a tare of this session has no level yet; a file needs it
             rest = Rest.of(calibration.method, self._shared.knowledge(rest), rest.date)
         return replace(calibration, tare=None if rest is calibration.rest else rest)
 
@@ -296,35 +297,40 @@ class SkinReader:
             raise ValueError(f"the board scanned in mode {self.board.mode}, now in {mode}")
 
     def read(self, scan: Scan) -> ForceScan:
-        """What a scan shows. Raises ValueError if it is of other cells, or of another mode."""
+        """What a scan shows.
+
+        :raises ValueError: it is of other cells, or of another mode.
+        :raises CommandRefused: as `Focus.follow`, where `focus` is set.
+        :raises DeviceLost: as `Focus.follow`, where `focus` is set.
+        """
         self.check_mode(scan.mode)
         if scan.rest_ratio is not None:
             self._shared.take_recorded(scan.rest_ratio)
         if self._made_for != (self._wanted, self.rest):  # rests are compared by identity
             self._make()
-        frame = self._estimator.estimate(scan.ratio, scan.reading_names)
+        estimate = self._estimator.estimate(scan.ratio, scan.reading_names)
         self._shared.last_estimator = self._estimator
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
-        at_rest = np.median(frame.level) if self._rest_level is None else self._rest_level
-        rise = np.asarray(frame.level - at_rest)
+        at_rest = np.median(estimate.level) if self._rest_level is None else self._rest_level
+        rise = np.asarray(estimate.level - at_rest)
         force_n = force_n_std = np.full(rise.shape, np.nan)
         # Without newtons, the rise takes the place of the force in sums and centres of contacts.
-        of_contacts = np.maximum(rise, 0.0), frame.level_std
+        of_contacts = np.maximum(rise, 0.0), estimate.level_std
         calibration, geometry = self._shared.calibration, None
         if calibration is not None and self.has_forces:
             geometry = calibration.geometry
-            force_n, force_n_std = calibration.model.predict(rise, frame.level_std)
+            force_n, force_n_std = calibration.model.predict(rise, estimate.level_std)
             of_contacts = force_n, force_n_std
-        contacts = self._tracker.update(scan.time_us, frame.touched, *of_contacts)
+        contacts = self._tracker.update(scan.time_us, estimate.touched, *of_contacts)
         if geometry is not None:
             contacts = tuple(geometry.placed(contact, force_n) for contact in contacts)
         if (focus := self.focus) is not None:
-            focus.follow(frame.touched, len(contacts), scan)
+            focus.follow(estimate.touched, len(contacts), scan)
         shown: dict[str, object] = {
             "force_n": force_n,
             "force_n_std": force_n_std,
             "contacts": contacts,
-            "estimate": frame,
+            "estimate": estimate,
             "geometry": geometry,
         }
         return ForceScan(**(vars(scan) | shown))
@@ -335,13 +341,13 @@ class SkinReader:
         self._make()
 
     def _make(self) -> None:
-        """Make the estimator for the method and the rest that are in force."""
+        """Make the estimator for the method and the rest that hold now."""
         method, rest = self._wanted, self.rest
         self._made_for = method, rest
         self._estimator = self._shared.estimator(method, rest)
         self._rest_level: Float | None = None  # (R, C) [S; 1 for `voltage`]; None: unknown
         if isinstance(rest, Rest) and self.has_forces:
-            self._rest_level = rest.level  # the same level that the curves were learned above
+            self._rest_level = rest.level  # the level above which the curves were learned
         elif rest is not None:  # what this method makes of the rest, which may be below 0 by noise
             self._rest_level = np.maximum(self._estimator.rest_level(), 0.0)
 
@@ -356,9 +362,13 @@ class CalibratedSkin(Closing):
         region is read.
 
     Iterating and `latest` are as those of `Device`, with forces. If another unit is plugged in at
-    the same port, they raise DeviceLost.
+    the same port, they raise DeviceLost. With `focus`, iterating also raises what `Focus.follow`
+    does.
 
-    :raises ValueError: the calibration is of another unit or geometry.
+    :raises ValueError: the calibration is of another unit, size or mode; with `focus`: the board
+        reads far ends.
+    :raises CommandRefused: with `focus`: the board has no regions, or is a recording.
+    :raises DeviceLost: with `focus`: the board does not answer.
     """
 
     def __init__(
