@@ -52,7 +52,7 @@ def calibration(pressed: int = 5) -> Calibration:
 
 
 def forces(of_skin: Calibration, level: Float) -> Float:
-    """At these levels (2, 3), above the rest in force."""
+    """At these levels (2, 3), above the rest that holds now."""
     return of_skin.model.predict(level - of_skin.untouched.level, np.full((2, 3), 1e-7))[0]
 
 
