@@ -134,16 +134,20 @@ class FullFit:
         """
         if self._moved_log > SEGMENT_STD:
             self._moved_log = 0.0
-            self._by_segment = self._weighted(self._circuit.by_wires(), SEGMENT_STD)
+            by_wires = self._circuit.by_wires()
+            by_layers = by_wires.reshape(len(by_wires), 2, -1).sum(axis=2)
+            self._by_segment = self._weighted(by_wires, SEGMENT_STD)
             self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
             # N without leads; and what leads add to it, for each ohm^2 of their variance.
             self._noise = gram(self._by_segment)
             np.einsum("ii->i", self._noise)[:] += 1.0
             self._by_lead = self._weighted(self._belief.leads_of_ports.copy())
             self._of_leads = gram(self._by_lead)
+        else:
+            by_layers = self._circuit.by_layers()
         self._by_cell = self._weighted(self._circuit.by_cell())
         by_mean_lead = np.full((self._modelled.size, 1), float(self._belief.lead_count))
-        direct = [self._circuit.by_layers(), by_mean_lead]
+        direct = [by_layers, by_mean_lead]
         if self._belief.has_leaks:
             direct.append(1e-6 * self._circuit.by_leaks())  # by uS
         # Cells at rest follow the means of the wires.
