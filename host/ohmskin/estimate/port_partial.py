@@ -4,7 +4,7 @@
 Symbols are those of `port_currents` and `port_noise`; K are the readings of a cell that were read.
 
     I = sum_{k in K} s_k R_k (y_k - o_k - b_k) / sum_{k in K} R_k^2 ,
-    s_I^2 = v_I / sum R_k^2 + max(0, s^2 - v / 2) (sum R_k / sum R_k^2)^2 .
+    s_I^2 = v_I / sum R_k^2 .
 
 Fewer than four readings do not show the offset o_k of each node, nor v. Both are taken from the
 last frame in which all was read; before there was one, from the rest readings. v is that of the
@@ -13,9 +13,9 @@ frame nor rest was read, o_k is 0, and of two or more readings,
 
     v = median over cells of (I_1 - I_2)^2 / (R_1^-2 + R_2^-2) / 0.455 ,
 
-with I_1 and I_2 the currents that two of the readings show. In every case, v is at least 2 s^2. v_I
-is not taken from another frame, because what is touched decides where lines charge. A single
-reading has v_I = v. Several show it as in `port_noise`:
+with I_1 and I_2 the currents that two of the readings show. In every case, v is at least 2 s^2, as
+of readings that round independently. v_I is not taken from another frame, because what is touched
+decides where lines charge. A single reading has v_I = v. Several show it as in `port_noise`:
 
     v_cell = sum_k residual_k^2 / (|K| - 1) ,  v_I = v + STAYING_SHARE^2 max(0, v_cell - v) .
 
@@ -125,8 +125,7 @@ class PartialEnds:
                 weight = slope[0] ** 2 / square_ohm
                 share = np.maximum(1.0 - CLEAR_NOISES * noise / np.maximum(by_cell, 1e-30), 0.0)
                 current -= (FIRST_SHARE - 1 + weight) * share * (by_each[..., 0] - by_each[..., 1])
-        alike = max(0.0, self._rounding - 0.5 * noise) * np.abs(slope).sum() ** 2
-        std = np.broadcast_to(np.sqrt(error / square_ohm + alike / square_ohm**2), current.shape)
+        std = np.broadcast_to(np.sqrt(error / square_ohm), current.shape)
         is_read, last = ~np.isnan(current), self._last.ports
         ports = PortCurrents(
             np.where(is_read, current, last.current), np.where(is_read, std, last.std)
