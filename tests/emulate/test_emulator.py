@@ -379,6 +379,25 @@ def both_in_every_state(real: Rig, model: Rig) -> None:
     np.testing.assert_array_equal(real.scans[-1].codes, model.scans[-1].codes)
 
 
+@pytest.mark.simavr
+@pytest.mark.parametrize("board", ["uno", "emulator"])
+def test_a_new_region_goes_before_a_whole_scan_that_is_due(board: str) -> None:
+    """The second scan after the command has it, and whole scans come all the same."""
+    with rig_of(board) as rig:
+        rig.must("configure", **DEFAULT)
+        rig.must("start")
+        for number in range(40):
+            mask = 6 << number % 3
+            rig.must("set_region", **(REGION | {"whole_every": 2, "row_mask": mask}))
+            heard_us = rig.frames("ack")[-1]["time_us"]
+            rig.run(0.02 + 0.001 * (number % 7))
+            headers = (scan.header for scan in rig.scans)
+            after = [each["row_mask"] for each in headers if each["time_us"] > heard_us]
+            assert mask in after[:2]
+        masks = [scan.header["row_mask"] for scan in rig.scans]
+        assert masks.count(0xFF) > len(masks) / 4
+
+
 # ------------------------------------------------------------- any request, and what it changes
 
 u8, u16, u32 = st.integers(0, 255), st.integers(0, 0xFFFF), st.integers(0, 0xFFFFFFFF)
