@@ -15,6 +15,7 @@ from ohmskin.circuit.skin import (
     port_resistance_ohm,
     readings,
 )
+from ohmskin.estimate import full_fit
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
@@ -149,8 +150,9 @@ def test_a_hidden_cell_says_that_it_is_uncertain() -> None:
     assert np.all(error < 4 * estimate.cell_siemens_std)
 
 
-def test_the_answer_is_where_the_posterior_is_highest() -> None:
+def test_the_answer_is_where_the_posterior_is_highest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against the posterior written out with dense matrices, along each of all resistances."""
+    monkeypatch.setattr(full_fit, "LEFT_OUT_STDS", 1e-3)
     random = np.random.default_rng(8)
     rest = skin_at_rest(3, 4, random)
     known, measured = told(readings(rest)), ten_bits(readings(touch(rest, 3, random)))
@@ -183,7 +185,29 @@ def test_the_answer_is_where_the_posterior_is_highest() -> None:
         for step in (-0.03, -0.003, 0.003, 0.03):
             moved = best.copy()
             moved[resistor] += step * (500.0 if resistor >= 36 else 1.0)
-            assert cost(moved) > lowest - 0.05
+            assert cost(moved) > lowest - 0.01
+
+
+def test_a_fit_ends_near_the_answer_of_more_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = random_trial(8, 8, 5, 20, seed=7).rounded(10)
+
+    def answers() -> list[Estimate]:
+        estimator = make_estimator("joint", trial.knowledge(0))
+        return [estimator.estimate(ratio) for ratio in trial.ratio]
+
+    usual = answers()
+    monkeypatch.setattr(full_fit, "LEFT_OUT_STDS", 1e-3)
+    monkeypatch.setattr(full_fit, "FOLLOWS_TIMES", 1.01)
+    more = answers()
+    assert sum(one.iterations for one in more) > 2 * sum(one.iterations for one in usual)
+    off_stds = np.array(
+        [
+            (short.cell_siemens - long.cell_siemens) / long.cell_siemens_std
+            for short, long in zip(usual, more, strict=True)
+        ]
+    )
+    assert np.sqrt(np.mean(off_stds**2)) < 0.06
+    assert np.abs(off_stds).max() < 1
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])

@@ -5,14 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from network import SkinCircuit  # tests/helpers
-from ohmskin.circuit.skin import Skin
-from ohmskin.circuit.small import cholesky, inverse_trace
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import Skin, port_resistance_ohm
+from ohmskin.estimate import full_fit
 from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.joint import STAYING_FAULT
-from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.port_readings import PortReadings
+from ohmskin.estimate.prior import LAYER_STD, LEAD_STD, REST_STD, SEGMENT_STD, CellPrior
+from ohmskin.estimate.wire_belief import LearnedWires
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ENUMS, MODES
 from studies.trials import Trial, bent_trial, jump_trial, palm_trial, random_trial
@@ -77,7 +83,39 @@ def test_a_sound_skin_is_never_said_to_be_damaged(trial: Trial, mode: str, metho
         assert STAYING_FAULT not in [one.message for one in found]
 
 
-def test_the_trace_of_an_inverse() -> None:
-    root = np.random.default_rng(0).standard_normal((6, 9))
-    system = root @ root.T
-    assert inverse_trace(cholesky(system)) == pytest.approx(np.trace(np.linalg.inv(system)))
+class NormalPrior(CellPrior):
+    """Without tails: then the distribution of chi-square is known."""
+
+    def about(self, means: Float) -> CellPrior:
+        return self
+
+    def normal(
+        self, log_ohm: Float, cells: NDArray[np.intp] | slice = slice(None)
+    ) -> tuple[Float, Float]:
+        return self.expected[cells], self.std[cells] ** 2
+
+
+def test_skins_drawn_from_the_prior_are_no_surprise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chi-square is that of the readings which cells and wires leave free."""
+    monkeypatch.setattr(full_fit, "FOLLOWS_TIMES", np.inf)  # here nothing follows a tail
+    random, shape, ref_ohm = np.random.default_rng(0), (5, 6), 6e4
+    belief = LearnedWires(shape, WireOhm(200.0, 400.0, lead=300.0))
+    rest = np.log(random.uniform(1e5, 4e5, 30))
+    prior = NormalPrior(rest, np.full(30, REST_STD), np.zeros((30, 3)), belief.means)
+    noise = np.full(shape, 2e-8)
+    surprises = []
+    for _ in range(200):
+        top, bottom = (
+            ohm * np.exp(LAYER_STD * random.standard_normal() + SEGMENT_STD * own)
+            for ohm, own in zip((200.0, 400.0), random.standard_normal((2, *shape)), strict=True)
+        )
+        lead = 300.0 * (1 + LEAD_STD * random.standard_normal())
+        leads = lead + SEGMENT_STD * 300.0 * random.standard_normal(sum(shape))
+        siemens = np.exp(-rest - REST_STD * random.standard_normal(30)).reshape(shape)
+        rho = port_resistance_ohm(Skin(siemens, top, bottom)) + leads[:5, None] + leads[5:]
+        current = 1 / (rho + ref_ohm) + noise * random.standard_normal(shape)
+        ports = PortReadings(ratio=current, current=current, current_std=noise)
+        fit = FullFit(prior, belief, ref_ohm, ports, rest)
+        assert not fit.message
+        surprises.append(fit.surprise)
+    assert np.mean(surprises) == pytest.approx(1, abs=0.05)

@@ -69,18 +69,15 @@ def inverse(factor: Float) -> Float:
     return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
-def inverse_trace(factor: Float) -> float:
-    """The trace of (L L^T)^-1."""
-    lower, failed = lapack.dpotri(factor, lower=1)
-    _check(failed)
-    return float(lower.trace())
-
-
 def solve_lower(factor: Float, right: Float, *, transposed: bool = False) -> Float:
-    """x of L x = right, or of L^T x = right."""
-    solution, failed = lapack.dtrtrs(factor, right, lower=1, trans=int(transposed))
-    _check(failed)
-    return np.asarray(solution)
+    """x of L x = right, or of L^T x = right, for one or several columns."""
+    if right.ndim == 1 or right.flags.f_contiguous:
+        solution, failed = lapack.dtrtrs(factor, right, lower=1, trans=int(transposed))
+        _check(failed)
+        return np.asarray(solution)
+    # x^T L^T = right^T: in C's order, nothing is turned around, and half of the time is saved.
+    turned = blas.dtrsm(1.0, factor, right.T, side=1, lower=1, trans_a=int(not transposed))
+    return np.asarray(turned.T)
 
 
 def _check(failed: int) -> None:

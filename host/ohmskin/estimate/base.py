@@ -218,9 +218,10 @@ class Estimator(ABC):
         message = "; ".join(filter(None, (ports.fault, solution.message)))
         touched = self._touched(solution)
         level, level_std = self._level(readings, solution)
-        unknown = np.full((2, *shape), np.nan)
-        wires = unknown if solution.wire_ohm is None else solution.wire_ohm
-        wires_std = unknown if solution.wire_ohm_std is None else solution.wire_ohm_std
+        wires, wires_std = (
+            np.full((2, *shape), np.nan) if known is None else known
+            for known in (solution.wire_ohm, solution.wire_ohm_std)
+        )
         if knowledge.ref_log_std:
             wires_std = np.hypot(wires_std, knowledge.ref_log_std * wires)
         siemens, siemens_std = solution.cell_siemens, solution.cell_siemens_std

@@ -35,19 +35,18 @@ time. So each step is first tried with those of the step before, and they are ma
 step still moves something.
 """
 
-from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.small import cholesky, gram, inverse_trace, solve, solve_lower
+from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    CLOSE_STDS,
     HIDDEN_LOG,
+    LEFT_OUT_STDS,
     MAX_ITERATIONS,
     MAX_STEP_LOG,
     SEGMENT_STD,
@@ -65,6 +64,12 @@ TURNED_SHARE: Final = -0.25
 # these readings, and on large skins each step takes long. Chosen: in the tests, 140 of 16,400 fits
 # had a larger one after 12 steps, and none of them converged.
 HOPELESS_MISFIT: Final = 100.0
+# Slopes are too old for the last step if a log resistance has moved by more since they were made.
+# Chosen: then slopes, and so deviations, are off by some 15 %.
+OLD_LOG: Final = 0.15
+# A step is the last one only if the deviations of the priors that follow the tail (`_is_last`)
+# change by less than this factor. Chosen.
+FOLLOWS_TIMES: Final = 1.5
 # Limits of a cell's log resistance [log ohm].
 _LEAST_LOG_OHM, _MOST_LOG_OHM = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)
 
@@ -98,7 +103,8 @@ class FullFit:
         self.iterations, self.message = 0, ""
         self.log_cells: Float = start
         self._mean_stds = np.zeros(len(belief.means))  # u of the means
-        self._moved_log = np.inf  # the most that a log resistance can have moved since N was made
+        # The most that a log resistance can have moved since the slopes were made.
+        self._moved_log = np.inf
         self._evaluate()
         self._minimise()
         self._conclude()
@@ -128,23 +134,26 @@ class FullFit:
     def _linearise(self) -> None:
         """Make J and S for the present state.
 
-        Of all slopes, those of W take the longest time. So N is kept until a log resistance may
-        have moved by more than `SEGMENT_STD`, 10 %. Such a move changes W by about 10 %, and W need
-        not be more exact: nobody knows to 10 % by how much segments differ.
+        Slopes take the longest time. So they, and N, are kept while they are young (`OLD_LOG`), and
+        only the deviations of the cells are those of the present state.
         """
-        if self._moved_log > SEGMENT_STD:
-            self._moved_log = 0.0
-            by_wires = self._circuit.by_wires()
-            by_layers = by_wires.reshape(len(by_wires), 2, -1).sum(axis=2)
-            self._by_segment = self._weighted(by_wires, SEGMENT_STD)
-            self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
-            # N without leads; and what leads add to it, for each ohm^2 of their variance.
-            self._noise = gram(self._by_segment)
-            np.einsum("ii->i", self._noise)[:] += 1.0
-            self._by_lead = self._weighted(self._belief.leads_of_ports.copy())
-            self._of_leads = gram(self._by_lead)
-        else:
-            by_layers = self._circuit.by_layers()
+        if self._moved_log > OLD_LOG:
+            self._make_slopes()
+        self._cell_std = np.sqrt(self._variance)
+        self._slopes, self._factor = self._factorised(self._cell_std)
+
+    def _make_slopes(self) -> None:
+        """Make the slopes of h, and N, for the present state."""
+        self._moved_log = 0.0
+        by_wires = self._circuit.by_wires()
+        by_layers = by_wires.reshape(len(by_wires), 2, -1).sum(axis=2)
+        self._by_segment = self._weighted(by_wires, SEGMENT_STD)
+        self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
+        # N without leads; and what leads add to it, for each ohm^2 of their variance.
+        self._noise = gram(self._by_segment)
+        np.einsum("ii->i", self._noise)[:] += 1.0
+        self._by_lead = self._weighted(self._belief.leads_of_ports.copy())
+        self._of_leads = gram(self._by_lead)
         self._by_cell = self._weighted(self._circuit.by_cell())
         by_mean_lead = np.full((self._modelled.size, 1), float(self._belief.lead_count))
         direct = [by_layers, by_mean_lead]
@@ -154,8 +163,6 @@ class FullFit:
         by_rest = self._by_cell @ self._prior.by_means
         self._by_mean = self._weighted(np.hstack(direct)) + by_rest
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
-        self._cell_std = np.sqrt(self._variance)
-        self._slopes, self._factor = self._factorised(self._cell_std)
 
     def _with_leads(self, own_ohm: float) -> Float:
         """N, if each lead has this deviation from the mean lead [ohm]."""
@@ -174,34 +181,33 @@ class FullFit:
         return slopes, cholesky(gram(slopes, onto=noise))
 
     def _minimise(self) -> None:
-        """Take steps until one moves no reading and no cell by `CLOSE_STDS` deviations.
+        """Take steps until one leaves out next to nothing (`_is_last`).
 
         Each step is first tried with the slopes of the step before. From `USUAL_ITERATIONS` on,
         steps that turn back are shortened. The circuit is not evaluated after the last move:
         `modelled`, `misfit` and `wires` are as the last step has forecast them.
         """
         self._linearise()
-        step, moved_stds = self._step()
+        step = self._step()
         before = np.zeros_like(step)
         while self.iterations < MAX_ITERATIONS:
             self.iterations += 1
+            is_last = self._is_last(step)
             self._move(step if self.iterations < USUAL_ITERATIONS else _damped(step, before))
-            if moved_stds < CLOSE_STDS:
+            if is_last:
                 return
             before = step
             self._evaluate()
-            step, moved_stds = self._step()
-            # Old slopes are a little wrong. So a step that they give is the last one only if it is
-            # at most half as large as the last step may be.
-            if moved_stds >= 0.5 * CLOSE_STDS:
+            step = self._step()
+            if not self._is_last(step):
                 self._linearise()
-                step, moved_stds = self._step()
+                step = self._step()
             if self.iterations >= USUAL_ITERATIONS and self.misfit > HOPELESS_MISFIT:
                 break
         self.message = f"not converged in {self.iterations} iterations"
 
-    def _step(self) -> tuple[Float, float]:
-        """The step u' - u, and the largest move it makes, in deviations of a reading or of a cell.
+    def _step(self) -> Float:
+        """The step u' - u.
 
         The columns of J are per deviation that the cells had at the last linearisation. The prior
         of the cells, a normal that follows the tail (`CellPrior.normal`), is that of the present
@@ -212,10 +218,24 @@ class FullFit:
         present = np.concatenate([cell_stds, self._mean_stds])
         # S^-1 (y - h + J u), over the noise's deviation.
         self._probable_noise = solve(self._factor, self._residual + self._slopes @ present)
-        step = self._probable_noise @ self._slopes - present
-        readings_step = self._slopes @ step
-        cells_step = step[: cell_stds.size]
-        return step, float(max(np.abs(readings_step).max(), np.abs(cells_step).max()))
+        return np.asarray(self._probable_noise @ self._slopes - present)
+
+    def _is_last(self, step: Float) -> bool:
+        """Whether no further step would matter after this one.
+
+        What it leaves out must be less than `LEFT_OUT_STDS`, and slopes that logs of resistances
+        have left by `OLD_LOG` are too old. The normal that stands for the prior of a cell
+        follows the tail: its deviation must not change by more than `FOLLOWS_TIMES`.
+        """
+        cells_step = self._cell_std * step[: self.log_cells.size]
+        from_rest = self.log_cells - self._centre + cells_step
+        follows = np.maximum(self._prior.std**2, from_rest * from_rest) / self._variance
+        if max(follows.max(), 1.0 / follows.min()) > FOLLOWS_TIMES**2:
+            return False
+        layers_step = (self._belief.means_off(step[cells_step.size :]) - self._belief.means)[:2]
+        moved_log = self._moved_log + max(np.abs(cells_step).max(), np.abs(layers_step).max())
+        left_out_stds = moved_log * np.abs(self._slopes @ step).max()
+        return bool(moved_log < OLD_LOG and left_out_stds < LEFT_OUT_STDS)
 
     def _move(self, step: Float) -> None:
         """Take a step; less of it if a log resistance would move by more than `MAX_STEP_LOG`."""
@@ -237,9 +257,12 @@ class FullFit:
         In the fit, these differences were noise of covariance W W^T. In a residual whose whole
         covariance is S, the most probable differences, over s, are W^T S^-1 times the residual.
         """
-        segments_off = SEGMENT_STD * (self._probable_noise @ self._by_segment)
-        leads_off = self._own_lead_ohm**2 * (self._probable_noise @ self._by_lead)
-        return self._belief.wires_off(self._mean_stds, segments_off, leads_off)
+        segments_stds = self._probable_noise @ self._by_segment
+        leads_stds = self._own_lead_ohm * (self._probable_noise @ self._by_lead)
+        self._wires_square = float(segments_stds @ segments_stds + leads_stds @ leads_stds)
+        return self._belief.wires_off(
+            self._mean_stds, SEGMENT_STD * segments_stds, self._own_lead_ohm * leads_stds
+        )
 
     @property
     def modelled(self) -> Float:
@@ -256,17 +279,17 @@ class FullFit:
         """Chi-square per port: the mean square of the most probable noise of the readings."""
         return float(self._probable_noise @ self._probable_noise) / self._current.size
 
-    @cached_property
+    @property
     def surprise(self) -> float:
-        """The misfit over what this model expects of it: about 1 or less if the model holds.
+        """Chi-square over what this model expects of it: about 1 or less if the model holds.
 
-        If the residual has the covariance S, its most probable noise, S^-1 times the residual, has
-        the covariance S^-1. So the misfit is expected to be the trace of S^-1 over the number of
-        ports. Where cells and wires are free to explain the readings, that is much less than 1, and
-        the misfit alone does not show whether the model holds.
+        If v = S^-1 (y - h + J u), the most probable noise of covariance N is N v, and its
+        chi-square is v^T N v. As the residual has the covariance S, that is expected to be the
+        trace of S^-1 N = 1 - O O^T: the number of readings that cells and means leave free. Where
+        these are free to explain the readings, that is much less than the number of ports, and the
+        misfit alone does not show whether the model holds.
         """
-        expected = inverse_trace(self._factor) / self._current.size
-        return self.misfit / max(expected, 1e-12)
+        return (self.misfit * self._current.size + self._wires_square) / self._free
 
     def _conclude(self) -> None:
         """Posterior deviations of the cells by the last J and S: log_cells_std and its parts.
@@ -292,7 +315,9 @@ class FullFit:
         """
         cell_std, cells = self._cell_std, slice(self._cell_std.size)
         whitened = solve_lower(self._factor, self._slopes)
-        learned = np.einsum("ij,ij->j", whitened, whitened)[cells]
+        learned = np.einsum("ij,ij->j", whitened, whitened)
+        self._free: float = max(self._current.size - float(learned.sum()), 1e-9)
+        learned = learned[cells]
         with_means = whitened[:, cells].T @ whitened[:, cell_std.size :]  # O^T O of cells and means
         self._unnoticed, unnoticed_std = self._find_unnoticed(learned)
         if self._unnoticed.any():

@@ -76,8 +76,10 @@ MEMORY: Final = 0.8
 
 # A fit gives up after so many steps, so that the time of a frame is bounded.
 MAX_ITERATIONS: Final = 40
-# A step that moves no reading and no cell by more deviations is the last one.
-CLOSE_STDS: Final = 0.5
+# A step of a fit is the last one if what it leaves out moves no reading, and no touched cell, by so
+# many deviations. Slopes change by about the share by which resistances do: so a step that moves
+# something by n deviations, and logs of resistances by m, leaves out about n m of them.
+LEFT_OUT_STDS: Final = 0.25
 # With a larger chi-square per port, no resistances explain the readings.
 MAX_CHI2: Final = 1.5
 # No step of a fit moves a log resistance by more, which is a factor of 4.5. And a frame in which a

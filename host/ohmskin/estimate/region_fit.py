@@ -24,7 +24,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.small import cholesky, gram, solve_lower, solve_positive
 from ohmskin.estimate.port_partial import STALE_SHARE
 from ohmskin.estimate.port_readings import PortReadings
-from ohmskin.estimate.prior import CLOSE_STDS, MAX_CHI2, MAX_STEP_LOG, CellPrior
+from ohmskin.estimate.prior import LEFT_OUT_STDS, MAX_CHI2, MAX_STEP_LOG, CellPrior
 from ohmskin.estimate.sparse_fit import Cells, RestNetwork
 from ohmskin.estimate.wire_belief import WireBelief
 
@@ -120,7 +120,7 @@ class RegionFit:
             system = by_cell.T @ by_cell
             system.ravel()[:: region.size + 1] += 1.0 / variance
             move = solve_positive(system, residual @ by_cell - (x + centre) / variance)
-            is_last = (move * move * system.diagonal()).max() < CLOSE_STDS**2
+            is_last = (move**4 * system.diagonal()).max() < LEFT_OUT_STDS**2
             move = np.minimum(np.maximum(move, -MAX_STEP_LOG), MAX_STEP_LOG)  # faster than np.clip
             x = x + move
             if is_last:

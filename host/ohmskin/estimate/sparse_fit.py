@@ -55,8 +55,8 @@ from ohmskin.circuit.small import cholesky, gram, inverse, solve, solve_lower, s
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    CLOSE_STDS,
     HIGHEST_TOUCH_SIEMENS,
+    LEFT_OUT_STDS,
     MAX_CHI2,
     MAX_ITERATIONS,
     MAX_STEP_LOG,
@@ -387,7 +387,7 @@ class FewTouches:
         system.ravel()[:: self.cells.size + 1] += precision
         step = solve_positive(system, pull - from_rest * precision)
         self.steps += 1
-        is_last = (step * step * system.diagonal()).max() < CLOSE_STDS**2
+        is_last = (step**4 * system.diagonal()).max() < LEFT_OUT_STDS**2
         step = np.minimum(np.maximum(step, -MAX_STEP_LOG), MAX_STEP_LOG)  # faster than np.clip
         return self.log_siemens + step, bool(is_last)
 

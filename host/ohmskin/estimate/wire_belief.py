@@ -150,7 +150,9 @@ class SkinWires:
 
 @dataclass(eq=False)
 class _State:
-    """What fits take for the wires: m, V, its root, and the wires that follow, once asked for."""
+    """What fits take for the wires: m, V, and what follows: its root, the deviations of m, and the
+    wires, once asked for.
+    """
 
     means: Float
     covariance: Float
@@ -158,6 +160,7 @@ class _State:
 
     def __post_init__(self) -> None:
         self.root: Float = np.asarray(np.linalg.cholesky(self.covariance), np.float64)
+        self.means_std: Float = np.sqrt(self.covariance.diagonal())
 
 
 class WireBelief(ABC):
@@ -330,7 +333,7 @@ class WireBelief(ABC):
 
     def means_std(self) -> Float:
         """Standard deviations of `means`, (n,)."""
-        return np.asarray(np.linalg.norm(self._root, axis=1))
+        return self._state.means_std
 
     def odd_lead_ohm(self) -> float:
         """Deviation of a lead from the mean lead, in so far as the mean lead is not known [ohm].
