@@ -30,9 +30,9 @@ those of Gauss-Newton in the space of the readings (Tarantola 2005, eq. 3.51),
 
     u' = J^T S^-1 (y - h(u) + J u) ,   S = J J^T + N ,
 
-and the posterior covariance of u is 1 - J^T S^-1 J = 1 - O^T O. Making J, N and S takes most of the
-time. So each step is first tried with those of the step before, and they are made anew only if this
-step still moves something.
+and the posterior covariance of u is 1 - J^T S^-1 J = 1 - O^T O. To make J, N and S takes most of
+the time. So each step is first tried with those of the step before. If it is not the last one
+(`FullFit._is_last`), J and S follow the priors of the cells, and slopes that are old are made anew.
 """
 
 from typing import Final
@@ -188,26 +188,25 @@ class FullFit:
         `modelled`, `misfit` and `wires` are as the last step has forecast them.
         """
         self._linearise()
-        step = self._step()
+        step, is_last = self._step()
         before = np.zeros_like(step)
         while self.iterations < MAX_ITERATIONS:
             self.iterations += 1
-            is_last = self._is_last(step)
             self._move(step if self.iterations < USUAL_ITERATIONS else _damped(step, before))
             if is_last:
                 return
             before = step
             self._evaluate()
-            step = self._step()
-            if not self._is_last(step):
+            step, is_last = self._step()
+            if not is_last:
                 self._linearise()
-                step = self._step()
+                step, is_last = self._step()
             if self.iterations >= USUAL_ITERATIONS and self.misfit > HOPELESS_MISFIT:
                 break
         self.message = f"not converged in {self.iterations} iterations"
 
-    def _step(self) -> Float:
-        """The step u' - u.
+    def _step(self) -> tuple[Float, bool]:
+        """The step u' - u, and whether no further step would matter after it (`_is_last`).
 
         The columns of J are per deviation that the cells had at the last linearisation. The prior
         of the cells, a normal that follows the tail (`CellPrior.normal`), is that of the present
@@ -218,7 +217,8 @@ class FullFit:
         present = np.concatenate([cell_stds, self._mean_stds])
         # S^-1 (y - h + J u), over the noise's deviation.
         self._probable_noise = solve(self._factor, self._residual + self._slopes @ present)
-        return np.asarray(self._probable_noise @ self._slopes - present)
+        step = np.asarray(self._probable_noise @ self._slopes - present)
+        return step, self._is_last(step)
 
     def _is_last(self, step: Float) -> bool:
         """Whether no further step would matter after this one.
