@@ -195,10 +195,11 @@ def test_offsets_that_whole_scans_have_shown_are_taken_from_one_reading() -> Non
     "method", sorted({*METHODS, "voltage"} - {"joint", "touch", "matrix", "ohm"})
 )
 def test_methods_that_need_all_readings_say_so(method: str) -> None:
-    _, rest, frames = trial("touches")
-    estimator = make_estimator(method, knowledge(rest))
+    ratio = np.full((2, 2, 4), 0.5)
+    ratio[..., 2:] = np.nan
+    estimator = make_estimator(method, SkinKnowledge(2, 2))
     with pytest.raises(ValueError, match=f"'{method}' takes whole scans of a b c d: use 'joint'"):
-        estimator.estimate(of_region(frames[0], slice(None), slice(None), READ["half"]))
+        estimator.estimate(ratio)
 
 
 def test_a_frame_may_have_fewer_readings_than_the_skin() -> None:
