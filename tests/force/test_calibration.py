@@ -48,6 +48,7 @@ def calibration(pressed: int = 5) -> Calibration:
         model=found.model_,
         indenter_area_m2=1e-4,
         nominal_wire_ohm=WireOhm(100.0),
+        largest_force_n=float(force_n.max()),
     )
 
 
@@ -106,13 +107,40 @@ def test_files_of_before_leads_and_modes_are_read(tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     for name in ("mode", "nominal_lead_ohm", "lead_std_ohm", "top_wire_log_std"):
         del content[name]
-    del content["bottom_wire_log_std"]
+    for name in ("bottom_wire_log_std", "largest_force_n"):
+        del content[name]
     path.write_text(json.dumps(content | {"wire_log_std": 0.125}))
     loaded = load_calibration(path)
-    assert loaded.mode == "near"
+    assert (loaded.mode, loaded.largest_force_n) == ("near", None)
     wires = loaded.nominal_wire_ohm
     assert (wires.lead, wires.lead_std_ohm) == (None, None)
     assert (wires.top_log_std, wires.bottom_log_std) == (0.125, 0.125)
+
+
+def test_a_force_that_readings_do_not_tell_is_expected_among_those_of_the_presses() -> None:
+    """By the posterior on a grid, and no other force changes."""
+    known = replace(calibration(), largest_force_n=8.0)
+    rise = np.array([[20e-6, 20e-6, 20e-6], [90e-6, 20e-6, 20e-6]])
+    rise_std = np.array([[1e-6, 200e-6, 2e-3], [300e-6, 200e-6, np.nan]])
+    touched = np.array([[True, True, True], [True, False, True]])
+    plain, plain_std = known.model.predict(rise, rise_std)
+    found, found_std = known.forces(rise, rise_std, touched)
+    unknown = np.array([[False, True, True], [True, False, False]])
+    np.testing.assert_array_equal(found[~unknown], plain[~unknown])
+    np.testing.assert_array_equal(found_std[~unknown], plain_std[~unknown])
+    assert (plain_std[unknown] > 8.0).all()
+    grid_n = np.linspace(-200.0, 200.0, 400_001)
+    for cell in np.argwhere(unknown):
+        at = tuple(cell)
+        precision = 8.0**-2 - plain_std[at] ** -2
+        log_p = ((grid_n - plain[at]) / plain_std[at]) ** 2 + precision * (grid_n - 4.0) ** 2
+        share = np.exp(-0.5 * log_p)
+        share /= share.sum()
+        mean_n = share @ grid_n
+        assert found[at] == pytest.approx(mean_n, abs=1e-6)
+        assert found_std[at] == pytest.approx(np.sqrt(share @ (grid_n - mean_n) ** 2), rel=1e-6)
+    same = replace(known, largest_force_n=None).forces(rise, rise_std, touched)
+    np.testing.assert_array_equal(same[0], plain)
 
 
 def test_rest_is_what_the_method_reads() -> None:
@@ -189,6 +217,7 @@ def put(*place: Any) -> Callable[[dict[str, Any]], None]:
         (put("kind", 1, 2, 1), "kind holds int, not str"),
         (put("pooled", 1, 2, 1), "pooled holds int, not bool"),
         (put("indenter_area_m2", 0), "indenter_area_m2 is 0.0, it must be above 0"),
+        (put("largest_force_n", -1), "largest_force_n is -1.0, it must be above 0"),
         (put("nominal_top_wire_ohm", -1), "nominal_top_wire_ohm is -1, it must be from 0"),
         (put("nominal_bottom_wire_ohm", []), "nominal_bottom_wire_ohm holds list, not float"),
     ],

@@ -388,10 +388,11 @@ class Calibrator:
         )
         pressed = np.argwhere(presses.counts).tolist()
         check_cells_differ({(row, column) for row, column in pressed}, presses.shape)
-        return self.calibration_of(regression.model_), regression.message_
+        largest_n = float(presses.force_n.max())
+        return self.calibration_of(regression.model_, largest_n), regression.message_
 
-    def calibration_of(self, model: ForceModel) -> Calibration:
-        """The calibration with these curves."""
+    def calibration_of(self, model: ForceModel, largest_force_n: float) -> Calibration:
+        """The calibration with these curves; largest_force_n: of all presses [N]."""
         date, told = now(), self.knowledge.nominal_wire_ohm
         return Calibration(
             unit_id=self.board.unit_id,
@@ -403,4 +404,5 @@ class Calibrator:
             # Single presses teach `joint` nothing that the fit of all presses does not know.
             nominal_wire_ohm=self.estimator.wires() if self.shows_wires else told,
             mode=self.board.mode,
+            largest_force_n=largest_force_n,
         )

@@ -381,7 +381,7 @@ class TotalFit:
             return
         least_n = np.maximum(LEAST_OFF_N, LEAST_OFF * force_n)
         self._out = (stds > OUTLIER_STDS) & (off > least_n)
-        self._largest_n = float(self._parts(self._contact()[0]).max())
+        self.largest_n = float(self._parts(self._contact()[0]).max())
         gains = self._of_gains
         square = np.sum(self._p[gains] ** 2 + self.covariance_.diagonal()[gains])
         cells = GAIN_CELLS + self._totals.rise.shape[1]
@@ -438,7 +438,7 @@ class TotalFit:
             exponent=exponent.clip(MIN_EXPONENT, MAX_EXPONENT).reshape(shape),
             exponent_std=np.sqrt(exponent_var).reshape(shape),
             correlation=(both / np.sqrt(slope_var * exponent_var)).clip(-1, 1).reshape(shape),
-            residual_std=0.1 * share * self._largest_n * every,
+            residual_std=0.1 * share * self.largest_n * every,
             residual_share=share * every,
             pooled=(self.gain_std() > POOLED_SHARE * self._gain_std).reshape(shape),
             held_out_rmse=np.nan * every,

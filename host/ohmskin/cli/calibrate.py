@@ -314,7 +314,7 @@ def _knead(
         log = replace(log, time_s=log.time_s + offset_s, any_zero=True)
     lags = any(sample.source != WEIGHTS for sample in given.forces)
     fit = kneading.learn(log, progress("scans"), lags=lags)
-    calibration = calibrator.calibration_of(fit.model(kneading.shape))
+    calibration = calibrator.calibration_of(fit.model(kneading.shape), fit.largest_n)
     calibration.save(out)
     first_s, stds = kneading.time_s[0], fit.gain_std()
     left_out = [[begin - first_s, end - first_s] for begin, end in fit.left_out]

@@ -25,13 +25,15 @@ rest.ratio               R, C, 4           readings of the untouched skin before
 rest.level               R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
 tare                                       the same of a later date, used in place of rest; null:
                                            there is none
+largest_force_n                            of the presses [N]; absent or null: not known
 geometry                                   where the cells are: kind, frame_id, and what `geometry`
                                            says of this kind; absent or null: not known
 kind                     R, C              "linear" or "power"
 slope, slope_std, ...    R, C              the other arrays of `ForceModel`; null where it has NaN
 ======================== ================= ======================================================
 
-Forces are `model.predict` of levels above `untouched.level`. Numbers are read back bit for bit.
+Forces are `Calibration.forces` of levels above `untouched.level`. Numbers are read back bit for
+bit.
 
 A file may come from somebody else. So its size is checked before it is read, its fields and their
 types and shapes before anything is made of them, and their ranges when the objects are made.
@@ -45,7 +47,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.skin import READINGS_PER_CELL, is_near
 from ohmskin.estimate.knowledge import (
     NO_WIRES,
@@ -76,6 +78,8 @@ UNIT_IDS: Final = FRAMES["hello"].span("unit_id")
 # The fields of the file, by where a `Calibration` keeps their values: in itself, with their types;
 # in its two rests; and in its model. (Those of its `WireOhm` are `WIRE_FIELDS`.)
 _OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str}
+# Numbers that may be null, but not 0 or less.
+_ABOVE_0: Final = ("indenter_area_m2", "largest_force_n")
 _RESTS: Final = ("rest", "tare")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
 # Those of the model that may be null.
@@ -129,6 +133,7 @@ class Calibration:
     tare: the untouched skin of a later date, which is used in place of `rest`; None: there is none.
     mode: which readings the scans hold, a name of the enum `mode`.
     geometry: where the cells are; None: nobody has said so.
+    largest_force_n: the largest force that the skin was pressed with [N]; None: not known.
     """
 
     unit_id: int
@@ -141,6 +146,7 @@ class Calibration:
     tare: Rest | None = None
     mode: str = "near"
     geometry: Geometry | None = None
+    largest_force_n: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.unit_id < UNIT_IDS:
@@ -159,9 +165,10 @@ class Calibration:
         placed = self.geometry
         if placed is not None and (placed.rows, placed.columns) != shape:
             raise ValueError(f"geometry is of {placed.rows}x{placed.columns} cells, not {shape}")
-        area_m2 = self.indenter_area_m2
-        if area_m2 is not None and not (np.isfinite(area_m2) and area_m2 > 0):
-            raise ValueError(f"indenter_area_m2 is {area_m2}, it must be above 0")
+        for name in _ABOVE_0:
+            number = getattr(self, name)
+            if number is not None and not (np.isfinite(number) and number > 0):
+                raise ValueError(f"{name} is {number}, it must be above 0")
         self.nominal_wire_ohm.check()
 
     @property
@@ -195,10 +202,34 @@ class Calibration:
             remedy = "calibrate this skin, or force it if the same skin has a new board"
             raise ValueError(f"this calibration is of {units}: {remedy}")
 
+    def forces(self, rise: Float, rise_std: Float, touched: Bool) -> tuple[Float, Float]:
+        """Force and its standard deviation [N], (R, C), of what cells show.
+
+        rise, rise_std: above rest, (R, C) [S; 1 for `voltage`]; touched: which cells are, (R, C).
+
+        They are `model.predict`, F with deviation s. But behind wires that resist much more than a
+        cell, readings say next to nothing of the force. So where s of a touched cell is above the
+        largest force L of the presses, the force is also expected from 0 to L: by a normal about
+        L / 2 that is only so narrow that a deviation of L is left,
+
+            (L / s)^2 F + (1 - (L / s)^2) L / 2 .
+
+        Raises ValueError as `predict` does.
+        """
+        force_n, std_n = self.model.predict(rise, rise_std)
+        largest_n = self.largest_force_n
+        if largest_n is None or not (unknown := touched & (std_n > largest_n)).any():
+            return force_n, std_n
+        share = np.where(unknown, (largest_n / np.maximum(std_n, largest_n)) ** 2, 1.0)
+        return (
+            share * force_n + (1.0 - share) * 0.5 * largest_n,
+            np.where(unknown, largest_n, std_n),
+        )
+
     def save(self, path: PathName) -> None:
         """Write the file whole or not at all. Raises ValueError if it cannot be written."""
         content: dict[str, Any] = {"format": FORMAT, "schema": SCHEMA}
-        for name in (*_OWN, "indenter_area_m2", "rows", "columns"):
+        for name in (*_OWN, *_ABOVE_0, "rows", "columns"):
             content[name] = getattr(self, name)
         content |= dict(zip(WIRE_FIELDS, self.nominal_wire_ohm, strict=True))
         for name in _RESTS:
@@ -252,17 +283,18 @@ def _from_content(content: Any) -> Calibration:
         raise ValueError(f"no calibration: field 'format' is not {FORMAT!r}")
     if type(content.get("schema")) is not int or content["schema"] != SCHEMA:
         raise ValueError(f"field 'schema' is not {SCHEMA}: written by another version of ohmskin")
-    # Older files have no mode, no leads, and one deviation for both layers.
+    # Older files have no mode, no leads, no largest force, and one deviation for both layers.
     of_both = content.pop("wire_log_std", None)
     absent = dict.fromkeys(WIRE_FIELDS[2:]) | dict.fromkeys(WIRE_FIELDS[3:5], of_both)
-    content = {"mode": "near", "geometry": None, **absent, **content}
-    numbers = ("indenter_area_m2", *WIRE_FIELDS)  # each may be null
+    absent |= {"mode": "near", "geometry": None, "largest_force_n": None}
+    content = absent | content
+    numbers = (*_ABOVE_0, *WIRE_FIELDS)  # each may be null
     names = {"format", "schema", "rows", "columns", "geometry"}
     names |= {*_OWN, *numbers, *_RESTS, *_MODEL_FIELDS}
     _require_fields(content, names)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
     model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
-    area_m2, *wires = (
+    area_m2, largest_n, *wires = (
         None if content[name] is None else _value(name, content[name], float) for name in numbers
     )
     return Calibration(
@@ -271,6 +303,7 @@ def _from_content(content: Any) -> Calibration:
         tare=None if content["tare"] is None else _rest("tare", content["tare"], shape),
         model=model,
         indenter_area_m2=area_m2,
+        largest_force_n=largest_n,
         nominal_wire_ohm=WireOhm(*wires),
         geometry=None if content["geometry"] is None else _geometry(content["geometry"], *shape),
     )

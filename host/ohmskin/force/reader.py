@@ -319,7 +319,7 @@ class SkinReader:
         calibration, geometry = self._shared.calibration, None
         if calibration is not None and self.has_forces:
             geometry = calibration.geometry
-            force_n, force_n_std = calibration.model.predict(rise, estimate.level_std)
+            force_n, force_n_std = calibration.forces(rise, estimate.level_std, estimate.touched)
             of_contacts = force_n, force_n_std
         contacts = self._tracker.update(scan.time_us, estimate.touched, *of_contacts)
         if geometry is not None:
