@@ -20,7 +20,7 @@ from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.estimate.port_readings import PortReader
+from ohmskin.estimate.port_readings import PortReader, PortReadings
 from ohmskin.estimate.prior import (
     LAYER_STD,
     LEAD_STD,
@@ -188,6 +188,46 @@ def test_the_answer_is_where_the_posterior_is_highest(monkeypatch: pytest.Monkey
             assert cost(moved) > lowest - 0.01
 
 
+def test_a_lesson_has_the_residual_at_the_answer_and_not_one_step_before_it() -> None:
+    """By the circuit itself, with the means that were believed."""
+    random = np.random.default_rng(8)
+    wires = WireOhm(100.0, 200.0, 0.0, 0.01, 0.01, 5.0)
+    belief = LearnedWires((3, 4), wires, may_be_bent=False)
+    for _ in range(5):
+        rest = skin_at_rest(3, 4, random)
+        touched = touch(rest, 3, random)
+        ports = PortReader(told(readings(rest))).read(ten_bits(readings(touched)))
+        expected = -np.log(rest.cell_siemens.ravel())
+        prior = CellPrior(expected, np.full(12, REST_STD), np.zeros((12, 3)), belief.means)
+        start = -np.log(touched.cell_siemens.ravel()) + 0.01 * random.standard_normal(12)
+        fit = FullFit(prior, belief, 6e4, ports, start)
+
+        def off_stds(log_cells: Float, ports: PortReadings = ports) -> Float:
+            top, bottom = (np.full((3, 4), ohm) for ohm in np.exp(belief.means[:2]))
+            skin = Skin(np.exp(-log_cells).reshape(3, 4), top, bottom)
+            current = 1 / (port_resistance_ohm(skin) + 2 * belief.means[2] + 6e4)
+            return ((ports.current - current) / ports.current_std).ravel()
+
+        moved = np.abs(off_stds(start) - off_stds(fit.log_cells)).max()
+        assert np.abs(fit.lesson.residual - off_stds(fit.log_cells)).max() < 0.1 * moved
+
+
+def test_what_a_frame_teaches_does_not_change_its_own_deviations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nobody has told wires and leads; a lesson moves what is believed of them."""
+    given = random_trial(8, 8, 8, 1, seed=5).rounded(10, wires_told=False)
+    stated = []
+    for method in ("joint", "touch"):
+        estimator = make_estimator(method, given.knowledge(0))
+        stated.append(estimator.estimate(given.ratio[0]).cell_siemens_std)
+        assert estimator.wires().top_log_std  # it has learned
+    monkeypatch.setattr(LearnedWires, "after_fit", lambda *_, **__: False)
+    for method, before in zip(("joint", "touch"), stated, strict=True):
+        estimator = make_estimator(method, given.knowledge(0))
+        np.testing.assert_array_equal(estimator.estimate(given.ratio[0]).cell_siemens_std, before)
+
+
 def test_a_fit_ends_near_the_answer_of_more_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = random_trial(8, 8, 5, 20, seed=7).rounded(10)
 
@@ -197,7 +237,7 @@ def test_a_fit_ends_near_the_answer_of_more_steps(monkeypatch: pytest.MonkeyPatc
 
     usual = answers()
     monkeypatch.setattr(full_fit, "LEFT_OUT_STDS", 1e-3)
-    monkeypatch.setattr(full_fit, "FOLLOWS_TIMES", 1.01)
+    monkeypatch.setattr(full_fit, "FOLLOWS_LOG", 0.01)
     more = answers()
     assert sum(one.iterations for one in more) > 2 * sum(one.iterations for one in usual)
     off_stds = np.array(

@@ -10,6 +10,7 @@ import pytest
 
 from network import SkinCircuit
 from ohmskin.arrays import Float
+from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.estimate.port_readings import PortReader
@@ -241,3 +242,55 @@ def test_two_readings_of_a_cell_are_worth_the_mean_of_two() -> None:
     found = np.array([ports.current for ports in read])
     assert found.std(axis=0).mean() < 1.05 * of_two.std(axis=0).mean()
     assert found.std(axis=0).mean() < 1.3 * np.mean([ports.current_std for ports in read])
+
+
+def touched_in_a_region(siemens: float) -> tuple[list[Estimate], Float]:
+    """By `joint`: frames of the region alone, of a touch that came after the whole frame at rest,
+    and the same frame read as a whole; the true cells.
+    """
+    made, rest, _ = trial("touches")
+    cells = made.rest.cell_siemens.copy()
+    cells[3, 5] = siemens
+    frame = ratio_from_codes(quantise(SkinCircuit(made.rest).readings(cells)[..., :4]))
+    at_rest = SkinCircuit(made.rest).readings(made.rest.cell_siemens)[..., :4]
+    estimator = make_estimator("joint", knowledge(rest))
+    estimator.estimate(ratio_from_codes(quantise(at_rest)))
+    part = of_region(frame, slice(2, 5), slice(4, 7), READ["near"])
+    found = [estimator.estimate(part) for _ in range(3)]
+    return [*found, make_estimator("joint", knowledge(rest)).estimate(frame)], cells
+
+
+@pytest.mark.parametrize("siemens", [5e-5, 2e-4, 6e-4])
+def test_a_touch_that_arrives_in_a_region_is_as_uncertain_as_in_a_whole_frame(
+    siemens: float,
+) -> None:
+    (*parts, whole), cells = touched_in_a_region(siemens)
+    for part in parts:
+        assert part.converged, part.message
+        assert part.cell_siemens[3, 5] == pytest.approx(cells[3, 5], rel=0.2)
+        stated = part.cell_siemens_std[3, 5] / whole.cell_siemens_std[3, 5]
+        assert 0.7 < stated < 1.5
+
+
+def test_what_a_whole_frame_cannot_be_relied_on_for_no_region_is() -> None:
+    """A cell that conducts more than any touch, then frames of another region."""
+    made, rest, _ = trial("touches")
+    cells = made.rest.cell_siemens.copy()
+    cells[5, 5] = 1 / 20
+    frame = ratio_from_codes(quantise(SkinCircuit(made.rest).readings(cells)[..., :4]))
+    estimator = make_estimator("joint", knowledge(rest))
+    whole = estimator.estimate(frame)
+    assert not whole.converged
+    part = estimator.estimate(of_region(frame, slice(0, 3), slice(0, 3), READ["near"]))
+    assert not part.converged
+
+
+def test_cells_outside_a_region_keep_all_of_their_uncertainty() -> None:
+    made, rest, _ = trial("touches")
+    cells = made.rest.cell_siemens.copy()
+    cells[6, 6] = 1 / 1500
+    frame = ratio_from_codes(quantise(SkinCircuit(made.rest).readings(cells)[..., :4]))
+    estimator = make_estimator("joint", knowledge(rest))
+    whole = estimator.estimate(frame)
+    part = estimator.estimate(of_region(frame, slice(0, 3), slice(0, 3), READ["near"]))
+    assert part.cell_siemens_std[6, 6] >= whole.cell_siemens_std[6, 6]

@@ -97,7 +97,7 @@ class NormalPrior(CellPrior):
 
 def test_skins_drawn_from_the_prior_are_no_surprise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chi-square is that of the readings which cells and wires leave free."""
-    monkeypatch.setattr(full_fit, "FOLLOWS_TIMES", np.inf)  # here nothing follows a tail
+    monkeypatch.setattr(full_fit, "FOLLOWS_LOG", 100.0)  # here nothing follows a tail
     random, shape, ref_ohm = np.random.default_rng(0), (5, 6), 6e4
     belief = LearnedWires(shape, WireOhm(200.0, 400.0, lead=300.0))
     rest = np.log(random.uniform(1e5, 4e5, 30))

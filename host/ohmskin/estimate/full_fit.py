@@ -35,6 +35,7 @@ the time. So each step is first tried with those of the step before. If it is no
 (`FullFit._is_last`), J and S follow the priors of the cells, and slopes that are old are made anew.
 """
 
+import math
 from typing import Final
 
 import numpy as np
@@ -64,12 +65,13 @@ TURNED_SHARE: Final = -0.25
 # these readings, and on large skins each step takes long. Chosen: in the tests, 140 of 16,400 fits
 # had a larger one after 12 steps, and none of them converged.
 HOPELESS_MISFIT: Final = 100.0
-# Slopes are too old for the last step if a log resistance has moved by more since they were made.
-# Chosen: then slopes, and so deviations, are off by some 15 %.
+# Slopes are too old if a log resistance has moved by more since they were made: then they are made
+# anew, and a step that would move so far is not the last one. Chosen: slopes, and so deviations,
+# are off by some 15 %.
 OLD_LOG: Final = 0.15
-# A step is the last one only if the deviations of the priors that follow the tail (`_is_last`)
-# change by less than this factor. Chosen.
-FOLLOWS_TIMES: Final = 1.5
+# A step is not the last one if the log of a deviation in J would change by more (`_is_last`).
+# Chosen: then it changes by half as much again.
+FOLLOWS_LOG: Final = 0.4
 # Limits of a cell's log resistance [log ohm].
 _LEAST_LOG_OHM, _MOST_LOG_OHM = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)
 
@@ -132,13 +134,14 @@ class FullFit:
         return slopes
 
     def _linearise(self) -> None:
-        """Make J and S for the present state.
+        """Make J and S for the deviations that the cells and the leads have now.
 
-        Slopes take the longest time. So they, and N, are kept while they are young (`OLD_LOG`), and
-        only the deviations of the cells are those of the present state.
+        Slopes take the longest time. So they are made for the present state only if they are old
+        (`OLD_LOG`).
         """
         if self._moved_log > OLD_LOG:
             self._make_slopes()
+        self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
         self._cell_std = np.sqrt(self._variance)
         self._slopes, self._factor = self._factorised(self._cell_std)
 
@@ -148,7 +151,6 @@ class FullFit:
         by_wires = self._circuit.by_wires()
         by_layers = by_wires.reshape(len(by_wires), 2, -1).sum(axis=2)
         self._by_segment = self._weighted(by_wires, SEGMENT_STD)
-        self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
         # N without leads; and what leads add to it, for each ohm^2 of their variance.
         self._noise = gram(self._by_segment)
         np.einsum("ii->i", self._noise)[:] += 1.0
@@ -183,9 +185,9 @@ class FullFit:
     def _minimise(self) -> None:
         """Take steps until one leaves out next to nothing (`_is_last`).
 
-        Each step is first tried with the slopes of the step before. From `USUAL_ITERATIONS` on,
-        steps that turn back are shortened. The circuit is not evaluated after the last move:
-        `modelled`, `misfit` and `wires` are as the last step has forecast them.
+        Each step is first tried with J and S of the step before. From `USUAL_ITERATIONS` on,
+        steps that turn back are shortened. The circuit is not evaluated after the last move: the
+        residual, `modelled`, `misfit` and `wires` are as the last step has forecast them.
         """
         self._linearise()
         step, is_last = self._step()
@@ -194,6 +196,7 @@ class FullFit:
             self.iterations += 1
             self._move(step if self.iterations < USUAL_ITERATIONS else _damped(step, before))
             if is_last:
+                self._residual = self._residual - self._slopes @ step
                 return
             before = step
             self._evaluate()
@@ -223,14 +226,15 @@ class FullFit:
     def _is_last(self, step: Float) -> bool:
         """Whether no further step would matter after this one.
 
-        What it leaves out must be less than `LEFT_OUT_STDS`, and slopes that logs of resistances
-        have left by `OLD_LOG` are too old. The normal that stands for the prior of a cell
-        follows the tail: its deviation must not change by more than `FOLLOWS_TIMES`.
+        What it leaves out must be less than `LEFT_OUT_STDS`: the move of the readings times that of
+        logs since the slopes were made. After it, slopes must not be old (`OLD_LOG`). And J has the
+        deviations of normals that stand for the priors of cells. As these follow the tail, the step
+        would change them, but by no more than `FOLLOWS_LOG`.
         """
         cells_step = self._cell_std * step[: self.log_cells.size]
         from_rest = self.log_cells - self._centre + cells_step
-        follows = np.maximum(self._prior.std**2, from_rest * from_rest) / self._variance
-        if max(follows.max(), 1.0 / follows.min()) > FOLLOWS_TIMES**2:
+        variance_ratio = np.maximum(self._prior.std**2, from_rest * from_rest) / self._cell_std**2
+        if max(variance_ratio.max(), 1.0 / variance_ratio.min()) > math.exp(2.0 * FOLLOWS_LOG):
             return False
         layers_step = (self._belief.means_off(step[cells_step.size :]) - self._belief.means)[:2]
         moved_log = self._moved_log + max(np.abs(cells_step).max(), np.abs(layers_step).max())
@@ -285,9 +289,9 @@ class FullFit:
 
         If v = S^-1 (y - h + J u), the most probable noise of covariance N is N v, and its
         chi-square is v^T N v. As the residual has the covariance S, that is expected to be the
-        trace of S^-1 N = 1 - O O^T: the number of readings that cells and means leave free. Where
-        these are free to explain the readings, that is much less than the number of ports, and the
-        misfit alone does not show whether the model holds.
+        trace of S^-1 N, which is that of 1 - O O^T: the number of readings that cells and means
+        leave free. Where these are free to explain the readings, that is much less than the number
+        of ports, and the misfit alone does not show whether the model holds.
         """
         return (self.misfit * self._current.size + self._wires_square) / self._free
 

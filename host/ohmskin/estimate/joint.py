@@ -18,6 +18,7 @@ few touches. Where they do not explain the frame, its answer is that of `joint`.
 readings no cell is known to be untouched, so every frame is for `joint`.
 """
 
+from dataclasses import replace
 from typing import ClassVar, Final
 
 import numpy as np
@@ -44,7 +45,7 @@ from ohmskin.estimate.prior import (
     rest_level,
     siemens_std,
 )
-from ohmskin.estimate.region_fit import RegionFit, WholeFrame
+from ohmskin.estimate.region_fit import Answer, RegionFit, WholeFrame
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_touches
 from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, LearnedWires, WireBelief
 
@@ -159,6 +160,7 @@ class JointEstimator(Estimator):
         self._surprise = 0.0  # running mean of the surprise of the fits so far
         # The last whole frame, for regions of the frames after it; and the last region.
         self._whole: FullFit | Touched | WholeFrame | None = None
+        self._whole_message = ""  # why that frame is no answer, in words, or empty
         self._region: RegionFit | None = None
         self._belief.reset()
         if self.knowledge.rest_ratio is None:
@@ -204,11 +206,20 @@ class JointEstimator(Estimator):
         """
         prior = self._prior_of(ports)
         if ports.region is not None and (part := self._of_region(prior, ports)):
-            return self._solution(ports, part), False
+            return self._solution(ports, part, self._whole_message), False
         touches = self._few_touches(prior, ports)
         if touches is not None and (touched := self._explained_by(touches)):
+            solution = self._solution(ports, touched)
             again = not ports.fault and self._belief.after_fit(touched, ports, again=again)
-            return self._solution(ports, touched, self._belief.fault), again
+            self._whole_message = self._belief.fault
+            # The cells are by what was believed before; the wires have learned from this frame.
+            wires = self._belief.believed_wires()
+            return replace(
+                solution,
+                message=self._whole_message,
+                wire_ohm=wires.segment_ohm,
+                wire_ohm_std=wires.segment_std_ohm,
+            ), again
         start = self._start(prior, ports, touches)
         self._belief.before_fit(start, ports)
         fit_prior = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
@@ -230,12 +241,12 @@ class JointEstimator(Estimator):
             self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
         if not message and self._surprise > STAYING_SURPRISE:
             message = STAYING_FAULT
+        solution = self._solution(ports, fit, message)  # now: a lesson moves the belief
         # A crowded frame teaches nothing: other forces explain it as well as other wires do.
         if ports.fault or message or prior.is_crowded(fit.log_cells):
             again = False
         else:
             again = self._belief.after_fit(fit, ports, again=again)
-        solution = self._solution(ports, fit, message)
         self._belief.expect_usual_leads(True)
         return solution, again
 
@@ -261,13 +272,22 @@ class JointEstimator(Estimator):
         assert ports.region is not None
         if self._whole is None:
             return None
-        if isinstance(self._whole, FullFit | Touched):
-            fit, ref_ohm = self._whole, self.knowledge.ref_ohm
-            logs = fit.log_cells, fit.log_cells_std
-            self._whole, self._region = WholeFrame(prior, self._belief, ref_ohm, *logs), None
+        if not isinstance(self._whole, WholeFrame):
+            self._whole, self._region = self._as_whole(prior, self._whole), None
         if self._region is None or not np.array_equal(self._region.region, ports.region):
             self._region = RegionFit(self._whole, ports.region)
-        return self._region if self._region.fit(ports) else None
+        if not self._region.fit(ports):
+            return None
+        if self._region.has_left():
+            self._whole = self._as_whole(prior, self._region)
+            self._region = RegionFit(self._whole, ports.region)
+            if not self._region.fit(ports):
+                return None
+        return self._region
+
+    def _as_whole(self, prior: CellPrior, answer: Answer) -> WholeFrame:
+        """This answer, as what regions of later frames are fitted about."""
+        return WholeFrame(prior, self._belief, self.knowledge.ref_ohm, answer)
 
     def _explained_by(self, touches: FewTouches) -> Touched | None:
         """The answer of these few touches, if they are all that the frame shows.
@@ -282,17 +302,14 @@ class JointEstimator(Estimator):
         """The answer that this fit gives. A whole frame is kept for the regions after it."""
         belief = self._belief
         if not isinstance(fit, RegionFit):
-            self._whole = fit
-        if isinstance(fit, FullFit):
-            wires, surprise = belief.wires(fit.wires), fit.surprise
-        else:
-            wires, surprise = belief.believed_wires(), 0.0
+            self._whole, self._whole_message = fit, message
+        wires = belief.wires(fit.wires) if isinstance(fit, FullFit) else belief.believed_wires()
         stds = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std, belief.stds()
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
         std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)
         # Where the model misses the readings by more than their noise, or by more than it expects
         # to, it is wrong somewhere. So all variances are widened by the ratio.
-        wider = max(1.0, fit.misfit, surprise) ** 0.5
+        wider = max(1.0, fit.misfit, fit.surprise) ** 0.5
         return Solution(
             cell_siemens=np.exp(-fit.log_cells).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),

@@ -15,7 +15,7 @@ A whole frame takes milliseconds, and a frame of a region about a tenth of that:
 read a thousand times a second.
 """
 
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from scipy.linalg import lapack
@@ -26,33 +26,55 @@ from ohmskin.estimate.port_partial import STALE_SHARE
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import LEFT_OUT_STDS, MAX_CHI2, MAX_STEP_LOG, CellPrior
 from ohmskin.estimate.sparse_fit import Cells, RestNetwork
-from ohmskin.estimate.wire_belief import WireBelief
+from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, WireBelief
 
 # Most steps of a frame; one that needs more is fitted as a whole. Chosen: a frame begins at the
-# frame before, which is a millisecond old.
-MOST_STEPS: Final = 6
+# frame before, and after a hard touch most steps are as long as `MAX_STEP_LOG` lets them.
+MOST_STEPS: Final = 9
+
+
+class Answer(Protocol):
+    """What is known of the cells after a frame: a `FullFit`, a `Touched` or a `RegionFit`."""
+
+    @property
+    def log_cells(self) -> Float:
+        """Log resistances of all cells, (RC,)."""
+
+    @property
+    def log_cells_std(self) -> Float:
+        """Their deviations, (RC,)."""
+
+    @property
+    def wires_log_std(self) -> Float:
+        """The parts of these that come from the means of the layers, (RC,)."""
+
+    @property
+    def leads_log_std(self) -> Float:
+        """The parts that come from the mean lead, (RC,)."""
+
+    @property
+    def misfit(self) -> float:
+        """Chi-square per port."""
+
+    @property
+    def surprise(self) -> float:
+        """Chi-square over what the model expects of it."""
 
 
 class WholeFrame:
-    """What the last whole frame has shown, for regions of the frames after it.
-
-    log_cells, log_cells_std: of all cells, and their deviations, (RC,).
-    """
+    """What has been shown so far, for regions of the frames that come: g0 and its deviations."""
 
     def __init__(
-        self,
-        prior: CellPrior,
-        belief: WireBelief,
-        ref_ohm: float,
-        log_cells: Float,
-        log_cells_std: Float,
+        self, prior: CellPrior, belief: WireBelief, ref_ohm: float, answer: Answer
     ) -> None:
         about = prior.about(belief.means)
-        is_soft = about.is_soft(log_cells, belief.shape)
+        is_soft = about.is_soft(answer.log_cells, belief.shape)
         self.prior, self.belief = about.for_soft_touches() if is_soft else about, belief
-        self.log_cells, self.log_cells_std = log_cells, log_cells_std
+        self.log_cells, self.log_cells_std = answer.log_cells, answer.log_cells_std
+        self.wires_log_std, self.leads_log_std = answer.wires_log_std, answer.leads_log_std
+        self.misfit, self.surprise = answer.misfit, answer.surprise
         self.series_ohm = ref_ohm + belief.lead_count * belief.means[2]
-        siemens = np.exp(-log_cells).reshape(belief.shape)
+        siemens = np.exp(-answer.log_cells).reshape(belief.shape)
         leak_siemens = belief.leak_siemens(belief.means)
         wires_ohm = np.exp(belief.means[:2])
         self.net = RestNetwork(siemens, *wires_ohm, far=belief.far, leak_siemens=leak_siemens)
@@ -66,13 +88,12 @@ class RegionFit:
         and from the mean lead, (RC,).
     modelled: port currents of the model, (RC,) [S]; outside of the region, those that are kept.
     iterations: steps of the last frame.
-    misfit: always 0, because a frame that does not fit gets no answer here.
+    misfit, surprise: of the whole frame, because a frame that does not fit gets no answer here.
     """
-
-    misfit: Final = 0.0
 
     def __init__(self, whole: WholeFrame, region: Cells) -> None:
         self.region, self._whole, net, belief = region, whole, whole.net, whole.belief
+        self.misfit, self.surprise = whole.misfit, whole.surprise
         self._x = -whole.log_cells[region]
         self._before = net.cell_siemens[region]
         self._port_volt = net.port_volt[region[:, None], region]
@@ -148,6 +169,12 @@ class RegionFit:
         # A cell outside changes by the same share as the current of a port that is not read.
         self.log_cells_std = np.hypot(whole.log_cells_std, STALE_SHARE * self._age)
         self.log_cells_std[region] = np.sqrt(covariance.diagonal())
-        self.wires_log_std, self.leads_log_std = np.zeros((2, self.log_cells.size))
+        self.wires_log_std = whole.wires_log_std.copy()
+        self.leads_log_std = whole.leads_log_std.copy()
         self.wires_log_std[region] = np.hypot(by_means[:, 0], by_means[:, 1])
         self.leads_log_std[region] = np.abs(by_means[:, 2])
+
+    def has_left(self) -> bool:
+        """Whether the fitted cells have moved too far from g0 for S."""
+        moved = self.log_cells[self.region] - self._whole.log_cells[self.region]
+        return bool(np.abs(moved).max() > LARGE_MOVE_LOG)

@@ -227,7 +227,8 @@ class Touched:
     modelled: port currents of the model, (RC,) [S].
     iterations: steps taken.
     lesson: what the readings say of the wires.
-    misfit: always 0: where few touches do not explain the readings, there is no `Touched`.
+    misfit, surprise: always 0: where few touches do not explain the readings, there is no
+        `Touched`.
     """
 
     cells: Cells
@@ -239,6 +240,7 @@ class Touched:
     iterations: int
     lesson: Lesson
     misfit: float = 0.0
+    surprise: float = 0.0
 
 
 def most_touches(shape: tuple[int, int]) -> float:
@@ -257,8 +259,9 @@ class SparseFit:
     current: port currents of the untouched skin per Vdd, (RC,) [S].
     model_variance: variance of these currents by the drift of cells and by what is not known of
         wires, (RC,) [S^2].
-    path_ohm: wires and leads from each cell to the sensed ends of its lines, (RC,) [ohm].
-    path_std_ohm: standard deviation of path_ohm, (RC,) [ohm].
+    least_ohm: wires from each cell to the sensed ends of its lines: a port has at least as much,
+        (RC,) [ohm].
+    path_std_ohm: standard deviation of these wires and of the leads, (RC,) [ohm].
     """
 
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
@@ -290,9 +293,10 @@ class SparseFit:
         per_std = belief.per_std(by_wire * by_ohm, by_lead, of_cells)
         self.model_variance = prior.std**2 @ (by_cell * by_cell)
         self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
-        self.path_ohm = belief.believed_wires().path_ohm
+        path_ohm = belief.believed_wires().path_ohm
+        self.least_ohm = path_ohm - (self.series_ohm - ref_ohm)
         *layer_std, lead_std_ohm = belief.means_std()[:3].tolist()
-        wires_std = np.hypot(max(layer_std), SEGMENT_STD) * self.path_ohm
+        wires_std = np.hypot(max(layer_std), SEGMENT_STD) * path_ohm
         self.path_std_ohm = wires_std + belief.lead_count * lead_std_ohm
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
@@ -410,7 +414,7 @@ class FewTouches:
         # that half of it is taken for the least. Where noise makes a reading show still less, this
         # least counts: the reading then asks for a very hard touch, and not for a touch of negative
         # resistance.
-        target_ohm = np.maximum(self._target_ohm[asked], 0.5 * skin.path_ohm[asked])
+        target_ohm = np.maximum(self._target_ohm[asked], 0.5 * skin.least_ohm[asked])
         # One cell more is a change of rank 1. It lowers rho to the target, and so
         # rho - target = slope / (1 / d + M), which is solved for 1 / d.
         missing_ohm = np.maximum(self._touched.port_ohm[asked] - target_ohm, 1e-9)
@@ -537,7 +541,7 @@ class FewTouches:
         by_cell = currents * sensed / net.cell_siemens
         by_cell[:, self.cells] = 0.0
         by_mean = by_cell @ skin.prior.by_means
-        if any(net.leak_siemens):
+        if skin.belief.has_leaks:
             by_mean[:, 3:] += 1e-6 * self._touched.by_leaks(ports)  # by uS
         by_cell *= skin.prior.std
         model_variance = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
