@@ -63,7 +63,7 @@ OFF: Final[dict[str, float]] = {
     "prior.STEADY_FADE": 0.0,
     "prior.AGILE_SHARE": 0.0,
     "prior.REACH_STDS": 1e-3,
-    "prior.CLOSE_STDS": 1e-3,
+    "prior.LEFT_OUT_STDS": 1e-3,
     "prior.CROWDED_SHARE": np.inf,
     "prior.PALM_SHARE": np.inf,
     "prior.SOFT_CORRELATION": 1.0,

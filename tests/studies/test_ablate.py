@@ -27,9 +27,10 @@ TRIED = [BY_LABEL["prior.SEGMENT_STD"], BY_LABEL["sparse_fit.RIVAL_SHARE"]]
 
 def test_every_number_is_tried() -> None:
     """Each once, where it stands; what is private or another's is none."""
-    assert BY_LABEL["prior.CLOSE_STDS"].variants == {"off": 1e-3, "halved": 0.25, "doubled": 1.0}
+    variants = BY_LABEL["prior.LEFT_OUT_STDS"].variants
+    assert variants == {"off": 1e-3, "halved": 0.125, "doubled": 0.5}
     assert BY_LABEL["prior.MAX_ITERATIONS"].variants == {"halved": 20, "doubled": 80}
-    assert not {"full_fit.CLOSE_STDS", "sparse_fit._HIGHEST_LOG_SIEMENS"} & set(BY_LABEL)
+    assert not {"full_fit.LEFT_OUT_STDS", "sparse_fit._HIGHEST_LOG_SIEMENS"} & set(BY_LABEL)
     assert set(OFF) <= set(BY_LABEL)
 
 
