@@ -43,7 +43,9 @@ wires may differ from what is believed of them, with the covariance P. So the re
 by S^-1 there.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -226,7 +228,7 @@ class Touched:
     leads_log_std: the part of it that comes from the mean lead, (RC,).
     modelled: port currents of the model, (RC,) [S].
     iterations: steps taken.
-    lesson: what the readings say of the wires.
+    teach: says what the readings tell of the wires. Only some frames are asked.
     misfit, surprise: always 0: where few touches do not explain the readings, there is no
         `Touched`.
     """
@@ -238,9 +240,14 @@ class Touched:
     leads_log_std: Float
     modelled: Float
     iterations: int
-    lesson: Lesson
+    teach: Callable[[], Lesson]
     misfit: float = 0.0
     surprise: float = 0.0
+
+    @cached_property
+    def lesson(self) -> Lesson:
+        """What the readings say of the wires."""
+        return self.teach()
 
 
 def most_touches(shape: tuple[int, int]) -> float:
@@ -484,25 +491,28 @@ class FewTouches:
         covariance_of_cells = solve(cholesky(system), np.eye(self.cells.size))  # A^-1
         # A mean that is one deviation off moves x by its column of A^-1 J S^-1 W.
         by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, by_mean_std)
-        # The lesson has more in its S. Touches are noise of nearly any size, because nobody knows
-        # how hard they are. And leads differ by more if the mean lead is not known.
-        by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
-        odd_leads = belief.odd_lead_ohm() * by_ohm * belief.leads_of_ports[ports]
-        noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads])
-        unlimited = cholesky(gram(noise, onto=residual_covariance))
-        lesson = Lesson(by_mean_std, residual, unlimited)
-        return self._answer(covariance_of_cells, np.abs(by_means), modelled, lesson)
+
+        def teach() -> Lesson:
+            # The lesson has more in its S. Touches are noise of nearly any size, because nobody
+            # knows how hard they are. And leads differ by more if the mean lead is not known.
+            by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
+            odd_leads = belief.odd_lead_ohm() * by_ohm * belief.leads_of_ports[ports]
+            noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads])
+            unlimited = cholesky(gram(noise, onto=residual_covariance))
+            return Lesson(by_mean_std, residual, unlimited)
+
+        return self._answer(covariance_of_cells, np.abs(by_means), modelled, teach)
 
     def _nothing_touched(self) -> Touched | None:
         """The answer if no cell is touched; None if a port draws less than in an untouched skin."""
         if self._residual.min() < -DEMAND_STDS:
             return None
         none = np.zeros((0, len(self._skin.belief.means)))
-        lesson = Lesson(none, np.zeros(0), np.zeros((0, 0)))
-        return self._answer(np.zeros((0, 0)), none, self._current, lesson)
+        nothing = Lesson(none, np.zeros(0), np.zeros((0, 0)))
+        return self._answer(np.zeros((0, 0)), none, self._current, lambda: nothing)
 
     def _answer(
-        self, covariance: Float, by_means: Float, modelled: Float, lesson: Lesson
+        self, covariance: Float, by_means: Float, modelled: Float, teach: Callable[[], Lesson]
     ) -> Touched:
         """The answer, in which cells at rest have the deviation of their prior.
 
@@ -514,7 +524,7 @@ class FewTouches:
         std[cells] = np.sqrt(covariance.diagonal())
         of_means[cells] = by_means
         parts = np.hypot(*of_means[:, :2].T), of_means[:, 2]
-        return Touched(cells, self.log_cells, std, *parts, modelled, self.steps, lesson)
+        return Touched(cells, self.log_cells, std, *parts, modelled, self.steps, teach)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
         """At which ports wires may move the reading by more than `HEAVY_SHARE` of its noise, (RC,).
