@@ -304,7 +304,8 @@ class FullFit:
         finds O^T O times the true u. So a mean that is truly one deviation off moves the fitted u
         of a cell by the element (cell, mean) of O^T O: its part of the cell's deviation is c times
         that. The u of the means are independent, so the parts of the first two are added as
-        variances.
+        variances. (Two things are left out: that cells at rest follow the means besides, and that
+        each u moves all means after its own.)
 
         This holds for cells whose prior can be believed. Cells that may be touched unnoticed
         (`_find_unnoticed`) get a wider deviation c' instead of c. The fit itself stays as it is. S
@@ -394,8 +395,8 @@ class FullFit:
 
         slopes, by_cell: dh by this, (RC, k), and by the log resistances of cells, (RC, RC).
 
-        The residual changes by -`slopes`, and the cells, of all unknowns alone, follow to keep h as
-        it is. With J the columns of the cells alone, their u change by
+        The residual changes by -`slopes`. Only the cells follow, to keep h as it is, as far as
+        their prior lets them. With J the columns of the cells alone, their u change by
         -J^T (N + J J^T)^-1 `slopes`.
         """
         by_cell = by_cell * self._cell_std
@@ -418,7 +419,8 @@ def _damped(step: Float, before: Float) -> Float:
     """A shorter step in the same direction, if this step turns back on the one before.
 
     Along the step before, this step is r times as long (`turned`). If steps change linearly from
-    place to place, there is a place where they are 0: after the share 1 / (1 - r) of this step.
+    place to place, there is a place where they are 0: after the share 1 / (1 - r) of this step, if
+    the step before was taken whole.
     Where wires and cells can explain the same readings, whole steps would go back and forth for
     ever, with r about -1.
     """

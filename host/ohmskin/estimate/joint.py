@@ -49,8 +49,8 @@ from ohmskin.estimate.region_fit import Answer, RegionFit, WholeFrame
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_touches
 from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, LearnedWires, WireBelief
 
-# The first two numbers are chosen. `make ablate` measures them with half, twice and none of each,
-# and the table "What each number earns" of docs/estimate.md says what came of it.
+# The first two numbers are chosen. `make ablate` tries other ones; the table "What each number
+# earns" of docs/estimate.md says what came of it.
 
 # Fits of the rest readings. Each has a prior about the median of the cells that the fit before it
 # found.
@@ -72,8 +72,8 @@ LEAK_FITS: Final = 8
 MOST_LEAK_US: Final = 100.0
 # Deviation of the leaks while they are being found [uS]. Chosen: a gigohm, so they stay as told.
 SEARCHED_LEAK_STD_US: Final = 1e-3
-# Cells at rest are taken anew if a leak has moved by more, or by 10 %. Chosen: 200 MOhm, which no
-# reading shows.
+# Cells at rest are taken anew if a leak has moved by more, and by more than 10 %. Chosen: 200 MOhm,
+# which no reading shows.
 LEAK_MOVE_US: Final = 5e-3
 # Standard deviation of a leak, as a share of it: leaks differ from crossing to crossing, and become
 # less while the skin dries. Chosen.

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 
-# All numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
-# table "What each number earns" of docs/estimate.md says what came of it.
+# All numbers are chosen. `make ablate` tries half and twice of each, and none where that is
+# possible; the table "What each number earns" of docs/estimate.md says what came of it.
 # Names that end in _STD and _LOG are a deviation and a difference of the log of a resistance, where
 # 0.1 is about 10 %. Names that end in _STDS are numbers of standard deviations.
 
@@ -40,7 +40,7 @@ HIDDEN_LOG: Final = 0.3
 CLEAR_LOG: Final = 0.1
 # Under fingertips a larger share of the cells is touched: the frame is crowded.
 CROWDED_SHARE: Final = 0.3
-# Under a palm, the touch is spread over as large a share of the cells.
+# Under a palm, the touch is spread over a larger share of the cells (`CellPrior.is_palm`).
 PALM_SHARE: Final = 0.45
 # Under soft fingertips, the rises of neighbours in a crowded frame correlate by more.
 SOFT_CORRELATION: Final = 0.5
@@ -76,9 +76,10 @@ MEMORY: Final = 0.8
 
 # A fit gives up after so many steps, so that the time of a frame is bounded.
 MAX_ITERATIONS: Final = 40
-# A step of a fit is the last one if what it leaves out moves no reading, and no touched cell, by so
-# many deviations. Slopes change by about the share by which resistances do: so a step that moves
-# something by n deviations, and logs of resistances by m, leaves out about n m of them.
+# A step of a fit is the last one if it leaves out less, in deviations: of a reading in `full_fit`,
+# of a touched cell in `sparse_fit` and `region_fit`. Slopes change by about the share by which
+# resistances do. So a step that moves something by n deviations, and logs by m since the slopes
+# were made, leaves out about n m.
 LEFT_OUT_STDS: Final = 0.25
 # With a larger chi-square per port, no resistances explain the readings.
 MAX_CHI2: Final = 1.5

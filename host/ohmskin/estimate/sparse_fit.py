@@ -72,8 +72,8 @@ from ohmskin.estimate.wire_belief import Lesson, WireBelief
 Cells = NDArray[np.intp]
 NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
 
-# All numbers are chosen. `make ablate` measures them with half, twice and none of each, and the
-# table "What each number earns" of docs/estimate.md says what came of it.
+# All numbers are chosen. `make ablate` tries half, twice and none of each; the table "What each
+# number earns" of docs/estimate.md says what came of it.
 
 # Touches are few if there are at most so many for each line, on average. A fingertip makes more.
 MAX_TOUCHES_PER_LINE: Final = 0.5
