@@ -31,8 +31,8 @@ those of Gauss-Newton in the space of the readings (Tarantola 2005, eq. 3.51),
     u' = J^T S^-1 (y - h(u) + J u) ,   S = J J^T + N ,
 
 and the posterior covariance of u is 1 - J^T S^-1 J = 1 - O^T O. To make J, N and S takes most of
-the time. So each step is first tried with those of the step before. If it is not the last one
-(`FullFit._is_last`), J and S follow the priors of the cells, and slopes that are old are made anew.
+the time. So each step is first tried with those of the step before. They are made anew only if it
+is not the last one (`FullFit._is_last`).
 """
 
 import math
@@ -65,9 +65,8 @@ TURNED_SHARE: Final = -0.25
 # these readings, and on large skins each step takes long. Chosen: in the tests, 140 of 16,400 fits
 # had a larger one after 12 steps, and none of them converged.
 HOPELESS_MISFIT: Final = 100.0
-# Slopes are too old if a log resistance has moved by more since they were made: then they are made
-# anew, and a step that would move so far is not the last one. Chosen: slopes, and so deviations,
-# are off by some 15 %.
+# A step is not the last one if a log resistance would have moved by more since J was made. Chosen:
+# slopes, and so deviations, are off by some 15 %.
 OLD_LOG: Final = 0.15
 # A step is not the last one if the log of a deviation in J would change by more (`_is_last`).
 # Chosen: then it changes by half as much again.
@@ -105,8 +104,8 @@ class FullFit:
         self.iterations, self.message = 0, ""
         self.log_cells: Float = start
         self._mean_stds = np.zeros(len(belief.means))  # u of the means
-        # The most that a log resistance can have moved since the slopes were made.
-        self._moved_log = np.inf
+        # The most that a log resistance can have moved since J was made.
+        self._moved_log = 0.0
         self._evaluate()
         self._minimise()
         self._conclude()
@@ -134,19 +133,7 @@ class FullFit:
         return slopes
 
     def _linearise(self) -> None:
-        """Make J and S for the deviations that the cells and the leads have now.
-
-        Slopes take the longest time. So they are made for the present state only if they are old
-        (`OLD_LOG`).
-        """
-        if self._moved_log > OLD_LOG:
-            self._make_slopes()
-        self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
-        self._cell_std = np.sqrt(self._variance)
-        self._slopes, self._factor = self._factorised(self._cell_std)
-
-    def _make_slopes(self) -> None:
-        """Make the slopes of h, and N, for the present state."""
+        """Make J, N and S for the present state."""
         self._moved_log = 0.0
         by_wires = self._circuit.by_wires()
         by_layers = by_wires.reshape(len(by_wires), 2, -1).sum(axis=2)
@@ -165,6 +152,9 @@ class FullFit:
         by_rest = self._by_cell @ self._prior.by_means
         self._by_mean = self._weighted(np.hstack(direct)) + by_rest
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
+        self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
+        self._cell_std = np.sqrt(self._variance)
+        self._slopes, self._factor = self._factorised(self._cell_std)
 
     def _with_leads(self, own_ohm: float) -> Float:
         """N, if each lead has this deviation from the mean lead [ohm]."""
@@ -227,9 +217,9 @@ class FullFit:
         """Whether no further step would matter after this one.
 
         What it leaves out must be less than `LEFT_OUT_STDS`: the move of the readings times that of
-        logs since the slopes were made. After it, slopes must not be old (`OLD_LOG`). And J has the
-        deviations of normals that stand for the priors of cells. As these follow the tail, the step
-        would change them, but by no more than `FOLLOWS_LOG`.
+        logs since J was made. J must not become older than `OLD_LOG`. And J has the deviations of
+        normals that stand for the priors of cells. As these follow the tail, the step would change
+        them, but by no more than `FOLLOWS_LOG`.
         """
         cells_step = self._cell_std * step[: self.log_cells.size]
         from_rest = self.log_cells - self._centre + cells_step
