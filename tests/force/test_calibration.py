@@ -117,28 +117,29 @@ def test_files_of_before_leads_and_modes_are_read(tmp_path: Path) -> None:
     assert (wires.top_log_std, wires.bottom_log_std) == (0.125, 0.125)
 
 
-def test_a_force_that_readings_do_not_tell_is_expected_among_those_of_the_presses() -> None:
-    """By the posterior on a grid, and no other force changes."""
+def test_a_force_that_readings_leave_open_is_expected_among_those_of_the_presses() -> None:
+    """By the posterior on a grid, where the force is above them; and no other force changes."""
     known = replace(calibration(), largest_force_n=8.0)
-    rise = np.array([[20e-6, 20e-6, 20e-6], [90e-6, 20e-6, 20e-6]])
-    rise_std = np.array([[1e-6, 200e-6, 2e-3], [300e-6, 200e-6, np.nan]])
+    rise = np.array([[200e-6, 20e-6, 300e-6], [400e-6, 200e-6, 200e-6]])
+    rise_std = np.array([[10e-6, 200e-6, 2e-3], [300e-6, 200e-6, np.nan]])
     touched = np.array([[True, True, True], [True, False, True]])
     plain, plain_std = known.model.predict(rise, rise_std)
     found, found_std = known.forces(rise, rise_std, touched)
-    unknown = np.array([[False, True, True], [True, False, False]])
-    np.testing.assert_array_equal(found[~unknown], plain[~unknown])
-    np.testing.assert_array_equal(found_std[~unknown], plain_std[~unknown])
-    assert (plain_std[unknown] > 8.0).all()
-    grid_n = np.linspace(-200.0, 200.0, 400_001)
-    for cell in np.argwhere(unknown):
-        at = tuple(cell)
-        precision = 8.0**-2 - plain_std[at] ** -2
-        log_p = ((grid_n - plain[at]) / plain_std[at]) ** 2 + precision * (grid_n - 4.0) ** 2
-        share = np.exp(-0.5 * log_p)
-        share /= share.sum()
-        mean_n = share @ grid_n
-        assert found[at] == pytest.approx(mean_n, abs=1e-6)
-        assert found_std[at] == pytest.approx(np.sqrt(share @ (grid_n - mean_n) ** 2), rel=1e-6)
+    is_open = np.array([[False, True, True], [True, False, False]])
+    is_above = is_open & (plain > 8.0)
+    assert is_above.sum() == 2
+    assert (plain_std[is_open] > 8.0).all()
+    np.testing.assert_array_equal(found[~is_above], plain[~is_above])
+    np.testing.assert_array_equal(found_std, np.where(is_open, 8.0, plain_std))
+    grid_n = np.linspace(-300.0, 300.0, 600_001)
+    for row, column in np.argwhere(is_above):
+        force_n, std_n = plain[row, column], plain_std[row, column]
+        precision = 8.0**-2 - std_n**-2
+        share = np.exp(-0.5 * (((grid_n - force_n) / std_n) ** 2 + precision * (grid_n - 8.0) ** 2))
+        mean_n = share @ grid_n / share.sum()
+        assert found[row, column] == pytest.approx(mean_n, abs=1e-6)
+        std_of_grid_n = np.sqrt(share @ (grid_n - mean_n) ** 2 / share.sum())
+        assert found_std[row, column] == pytest.approx(std_of_grid_n, rel=1e-6)
     same = replace(known, largest_force_n=None).forces(rise, rise_std, touched)
     np.testing.assert_array_equal(same[0], plain)
 

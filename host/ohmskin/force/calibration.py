@@ -208,23 +208,22 @@ class Calibration:
         rise, rise_std: above rest, (R, C) [S; 1 for `voltage`]; touched: which cells are, (R, C).
 
         They are `model.predict`, F with deviation s. But behind wires that resist much more than a
-        cell, readings say next to nothing of the force. So where s of a touched cell is above the
-        largest force L of the presses, the force is also expected from 0 to L: by a normal about
-        L / 2 that is only so narrow that a deviation of L is left,
+        cell, readings may allow any hard touch. So where s of a touched cell is above the largest
+        force L of the presses, its deviation is L. And if F is above L, it is the mean of F and a
+        normal about L that is only so narrow that this deviation is left,
 
-            (L / s)^2 F + (1 - (L / s)^2) L / 2 .
+            L + (L / s)^2 (F - L) .
 
         Raises ValueError as `predict` does.
         """
         force_n, std_n = self.model.predict(rise, rise_std)
         largest_n = self.largest_force_n
-        if largest_n is None or not (unknown := touched & (std_n > largest_n)).any():
+        if largest_n is None or not (is_open := touched & (std_n > largest_n)).any():
             return force_n, std_n
-        share = np.where(unknown, (largest_n / np.maximum(std_n, largest_n)) ** 2, 1.0)
-        return (
-            share * force_n + (1.0 - share) * 0.5 * largest_n,
-            np.where(unknown, largest_n, std_n),
-        )
+        share = (largest_n / np.maximum(std_n, largest_n)) ** 2
+        drawn_n = largest_n + share * (force_n - largest_n)
+        is_above = is_open & (force_n > largest_n)
+        return np.where(is_above, drawn_n, force_n), np.where(is_open, largest_n, std_n)
 
     def save(self, path: PathName) -> None:
         """Write the file whole or not at all. Raises ValueError if it cannot be written."""
