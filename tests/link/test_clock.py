@@ -104,6 +104,33 @@ def test_a_board_that_restarts_begins_anew(pause_s: float) -> None:
     assert np.diff(found_s).min() > 0
 
 
+def young_board(last_s: float) -> tuple[Float, Float]:
+    """Times of the board's clock, and of the host's: it is reset at 3 s, and scans from 8 s on."""
+    run_s = np.arange(0, last_s, 1 / HZ)
+    before_s, after_s = run_s[run_s < 3], run_s[run_s >= 8]
+    true_s = np.concatenate([before_s, after_s + 4])
+    return np.concatenate([before_s, after_s]), START_S + true_s
+
+
+def test_a_young_board_that_restarts_begins_anew() -> None:
+    """Its clock does not go back: at its first scan it is older than it was at its last."""
+    board_s, true_s = young_board(40.0)
+    found_s, _ = mapped(board_s, in_order(jitter(np.random.default_rng(8), true_s)))
+    error_s = np.abs(found_s - true_s)
+    assert error_s[board_s < 10].max() < 20e-3
+    assert error_s[board_s > 10].max() < 2e-3
+
+
+@pytest.mark.parametrize(("hz", "busy_s"), [(HZ, 5.0), (1.0, 3.5)])
+def test_a_host_that_was_busy_for_seconds_does_not_confuse(hz: float, busy_s: float) -> None:
+    board_s = np.arange(0, 60, 1 / hz)
+    true_s = START_S + board_s
+    from_s = START_S + 30.5
+    is_late = (true_s > from_s) & (true_s < from_s + busy_s)
+    found_s, _ = mapped(board_s, np.where(is_late, from_s + busy_s, true_s))
+    np.testing.assert_allclose(found_s, true_s, atol=1e-6)
+
+
 def test_a_clock_that_steps_is_followed() -> None:
     """The host was asleep, and its clock stood still."""
     random = np.random.default_rng(6)
@@ -143,6 +170,11 @@ def test_scan_times_are_free_of_the_jitter_of_their_arrival(seconds: int) -> Non
 def test_scan_times_follow_a_board_that_restarts() -> None:
     board_s = np.concatenate([np.arange(50), np.arange(50)]) / HZ
     host_s = np.concatenate([np.arange(50), 200 + np.arange(50)]) / HZ + 9.0
+    np.testing.assert_allclose(scan_times_s(scans_at(board_s, host_s)), host_s, atol=1e-6)
+
+
+def test_scan_times_follow_a_young_board_that_restarts() -> None:
+    board_s, host_s = young_board(60.0)
     np.testing.assert_allclose(scan_times_s(scans_at(board_s, host_s)), host_s, atol=1e-6)
 
 

@@ -55,7 +55,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.link import protocol
 from ohmskin.link.framing import MAX_BLOCK_BYTES, cobs_encode, encode
-from ohmskin.link.messages import MAX_RATE_ERROR, Hello, Scan
+from ohmskin.link.messages import MAX_RATE_ERROR, RESET_DELAY_S, Hello, Scan
 
 # Board time of the points that a line is fitted to. A ceramic resonator that warms drifts by up to
 # 10 ppm a second, which bends the line by 1 ms in this time.
@@ -210,6 +210,7 @@ class BoardClock:
         self._points: deque[_Point] = deque()  # of each block, the one that came earliest
         self._block_u_s = 0.0  # where the newest block begins
         self._last_u_s = 0.0  # of the newest point
+        self._pause_s = 0.0  # from the point before the newest to it, on the board's clock
         # What the line before the present one gave more at this time u; see the module.
         self._slew_s, self._slew_from_u_s = 0.0, 0.0
         # Of commands among scans: u at which the board had read them, and when they left.
@@ -248,12 +249,18 @@ class BoardClock:
     def add(self, time_us: float, host_time_s: float) -> None:
         """Learn that something at `time_us` of the board's clock was known here at `host_time_s`.
 
-        Calls come in the order of the board's clock. A time that goes back is a restart.
+        Calls come in the order of the board's clock. A time that goes back is a restart. So is one
+        that comes late after a pause: the clock of a board that was reset soon after it started
+        need not go back. (A host that was busy gets its late scans without a pause.)
         """
         u_s, t_s = 1e-6 * time_us, host_time_s
         line = self._line
         late_s = 0.0 if line is None else t_s - line.at(u_s)
-        if line is None or u_s <= self._last_u_s or late_s < -CLOCK_STEP_S:
+        pause_s = u_s - self._last_u_s
+        is_long = pause_s > max(_BLOCK_S, 2 * self._pause_s)
+        is_reset = is_long and late_s > RESET_DELAY_S + MAX_RATE_ERROR * pause_s
+        self._pause_s = pause_s
+        if line is None or pause_s <= 0 or late_s < -CLOCK_STEP_S or is_reset:
             self._restart(u_s, t_s)
             return
         self._last_u_s = u_s
@@ -340,12 +347,14 @@ def without_delays_s(board_s: Float, host_s: Float) -> Float:
     `FIT_WINDOW_S` of the board's clock there is a knot,
     whose time is by the line that fits the window around it. Between knots, times are interpolated.
     What comes before and after a step back is taken separately, and so is what comes before and
-    after a pause of a window, across which no line is fitted. Therefore there are no more than two
-    knots for each time, whatever the times are.
+    after a pause with a reset, or of a window, across which no line is fitted. Therefore there are
+    no more than two knots for each time, whatever the times are.
     """
     times_s, half_s = np.empty_like(host_s), FIT_WINDOW_S / 2
     steps_s = np.diff(board_s)
-    breaks = np.flatnonzero((steps_s <= 0) | (steps_s > FIT_WINDOW_S)) + 1
+    late_s = np.diff(host_s) - steps_s
+    is_reset = (steps_s > _BLOCK_S) & (late_s > RESET_DELAY_S + MAX_RATE_ERROR * steps_s)
+    breaks = np.flatnonzero((steps_s <= 0) | (steps_s > FIT_WINDOW_S) | is_reset) + 1
     for part in np.split(np.arange(host_s.size), breaks):
         u_s, t_s = board_s[part], host_s[part]
         count = 2 + int((u_s[-1] - u_s[0]) / half_s)

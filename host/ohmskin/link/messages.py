@@ -30,6 +30,9 @@ _DROPPED_SPAN = _SCAN.span("dropped")
 # up to 0.5 % off (data sheet of Murata's CSTCE16M0V53, which an Arduino Uno has), a crystal 0.01 %;
 # a fifth more is left for delays.
 MAX_RATE_ERROR = 0.006
+# A scan that comes this much later than expected, when scans begin again, is one of a board that
+# was reset meanwhile [s]. Chosen: more than what delays the arrival of scans.
+RESET_DELAY_S = 1.0
 # No sound board says that a scan takes longer. Chosen: three times the 3.2 s of the largest skin at
 # the longest settle time; the protocol has no such number.
 _MAX_SCAN_S = 10
@@ -441,6 +444,5 @@ class BoardDecoder:
         expected_us = self._time_us + elapsed_us
         wraps = round((expected_us - counter_us) / _TIME_SPAN_US)
         time_us = counter_us + _TIME_SPAN_US * wraps
-        # A second covers what delays the arrival of either scan.
-        is_near = abs(time_us - expected_us) < 1e6 + MAX_RATE_ERROR * elapsed_us
+        is_near = abs(time_us - expected_us) < 1e6 * RESET_DELAY_S + MAX_RATE_ERROR * elapsed_us
         return time_us if time_us >= 0 and is_near else counter_us
