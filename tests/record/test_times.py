@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 
 import ohmskin
 from calibrations import of_scene
+from ohmskin.link.device import Region
 from ohmskin.record.recorder import Recorder
 from stepped import stepped
 
@@ -25,6 +26,20 @@ def test_a_scan_says_when_its_middle_was() -> None:
     after_ns = time.time_ns()
     for scan in itertools.islice(skin, 20):
         middle_ns = 1e9 * scan.host_time_s - PERIOD_NS / 2
+        assert before_ns + middle_ns - 1e5 < scan.time_ns < after_ns + middle_ns + 1e5
+
+
+def test_whole_scans_between_those_of_a_region_say_when_their_middle_was() -> None:
+    """The periods differ, 100 ms and 11 ms. Host times are the board's here."""
+    before_ns = time.time_ns()
+    skin = stepped(URL)
+    after_ns = time.time_ns()
+    skin.set_region(Region([2, 3], [2, 3], "near", 10.0, whole_every=4))
+    scans = list(itertools.islice(skin, 20))
+    assert {scan.is_whole for scan in scans} == {False, True}
+    for scan in scans:
+        readings_ns = scan.codes_read.size * 1e9 * scan.slot_cycles / skin.info.clock_hz
+        middle_ns = 1e3 * scan.time_us + readings_ns / 2
         assert before_ns + middle_ns - 1e5 < scan.time_ns < after_ns + middle_ns + 1e5
 
 

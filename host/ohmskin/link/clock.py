@@ -127,8 +127,10 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
     It leaves out that frames may wait for those before them.
     """
     if board.board == "emulated":
-        # An emulated board sends a whole scan at the end of its period.
-        return 1 / board.rate_hz - scan_s(board, scan)
+        # An emulated board sends all of a scan at the end of its period.
+        is_between = board.whole_every and scan.is_whole and scan.mode == board.whole_mode
+        period_cycles = board.whole_scan_cycles if is_between else board.scan_cycles
+        return period_cycles / board.clock_hz - scan_s(board, scan)
     masks = (scan.row_mask, scan.rows), (scan.column_mask, scan.columns)
     header = _header(*(mask or protocol.all_lines(count) for mask, count in masks))
     codes = protocol.pack_codes(scan.codes_read, protocol.PER_PASS[scan.mode], scan.adc_bits)
