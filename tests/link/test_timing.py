@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """When readings are taken and when scans arrive: against the emulated and the simulated board."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lockstep import CPU_HZ, Rig, first_holds
 from ohmskin.arrays import Float
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
-from ohmskin.link.clock import line_delay_s, scan_s, slot_s
+from ohmskin.link.clock import byte_s, line_delay_s, scan_s, slot_s
 from ohmskin.link.messages import Hello, Scan
+from places import ROOT
 from stepped import stepped
 
 
@@ -33,6 +37,17 @@ def test_slots_and_scans_last_as_the_emulated_board_takes_them(
     assert slot_s(hello) == slots_s[0]
     last_s = (rows * columns * 4 - 1) * slots_s[0]  # from the scan's first reading to its last
     assert last_s < scan_s(hello) < (hello.scan_cycles + 1) / hello.clock_hz
+
+
+def test_a_picos_bytes_take_as_long_as_its_firmware_reckons() -> None:
+    """It has no serial line, but USB, and says a speed like all boards."""
+    header = (ROOT / "firmware" / "pico" / "pico_numbers.h").read_text()
+    (cycles,) = re.findall(r"cycles_per_byte\(uint32_t\) { return (\d+); }", header)
+    (clock_hz,) = re.findall(r"CLOCK_HZ = (\d+);", header)
+    skin = stepped("emulator://8x8")
+    board = replace(skin.info, board="pico", baud=500_000)
+    assert byte_s(board) == int(cycles) / int(clock_hz)
+    assert line_delay_s(skin.latest(), board) < 0.5e-3  # a full block of COBS on a line takes 5 ms
 
 
 @pytest.mark.simavr

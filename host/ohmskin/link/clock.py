@@ -73,6 +73,9 @@ _SLEW_S: Final = 1.0
 # A byte takes ten bits on a line of 8N1, as frames.toml says of `baud_default`: a start bit, eight
 # data bits and a stop bit.
 BITS_PER_BYTE: Final = 10
+# A Pico sends over USB, whatever speed its line is said to have. Its firmware reckons with so much
+# time for a byte [s] (`cycles_per_byte` in firmware/pico/pico_numbers.h).
+_PICO_BYTE_S: Final = 2e-6
 # The newest so many commands show delays. Chosen: one in a hundred is late, and few are as many.
 _COMMANDS: Final = 16
 # Time for the last conversion and for the pass of the main loop that packs its cell: 0.1 ms fits
@@ -102,7 +105,8 @@ def scan_s(board: Hello, scan: Scan | None = None) -> float:
 
 def byte_s(board: Hello) -> float:
     """Time that a byte takes on the line [s]; 0 on that of an emulated board."""
-    return 0.0 if board.board == "emulated" else BITS_PER_BYTE / board.baud
+    known = {"emulated": 0.0, "pico": _PICO_BYTE_S}
+    return known.get(board.board, BITS_PER_BYTE / board.baud)
 
 
 def answer_delay_s(board: Hello) -> float:
