@@ -7,6 +7,8 @@ import os
 import re
 import signal
 import struct
+import subprocess
+import sys
 import threading
 import time
 import tracemalloc
@@ -54,6 +56,21 @@ def test_a_silent_board_s_last_scans_reach_the_file(path: Path, hello: Hello) ->
         found = load_recording(path)
     assert found.cut_off
     assert_same(found.scans, [scan(0)])
+
+
+def test_a_program_that_closes_no_recording_ends_and_has_recorded_all(path: Path) -> None:
+    program = f"""
+import itertools, ohmskin
+from ohmskin.record.recorder import Recorder
+skin = ohmskin.open("emulator://3x4?speed=0")
+recorder = Recorder({str(path)!r}, skin.info)
+for scan in itertools.islice(skin, 30):
+    recorder.add(scan)
+raise SystemExit(3)
+"""
+    assert subprocess.run([sys.executable, "-c", program], timeout=60).returncode == 3
+    found = load_recording(path)
+    assert (len(found.scans), found.cut_off) == (30, False)
 
 
 def kept_waiting_s(process: int) -> float:

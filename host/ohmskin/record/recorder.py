@@ -6,6 +6,7 @@ killed, or whose disk was full, can be read up to its last whole chunk. So whoev
 hour loses half a second at most, whatever happens to the program.
 """
 
+import atexit
 import json
 import os
 import threading
@@ -84,7 +85,9 @@ class Recorder(Closing):
         self._epoch_ns = time.time_ns() - round(1e9 * now_s())
         # The writer ends a chunk of this size by itself; `flush` ends it long before.
         self._writer = Writer(self._file, chunk_size=LARGEST_RECORD_BYTES // 4)
-        self._flusher = threading.Thread(target=self._flush_often, name=f"flush {path}")
+        self._flusher = threading.Thread(
+            target=self._flush_often, name=f"flush {path}", daemon=True
+        )
         try:
             with self._writing():
                 self._writer.start(profile="", library="ohmskin")
@@ -96,6 +99,7 @@ class Recorder(Closing):
                 self._file.close()
             raise
         self._flusher.start()
+        atexit.register(self.close)  # for programs that end by an error
 
     def _channel(self, name: str) -> int:
         """Make the channel of a topic, with its schema. Returns the channel's id."""
@@ -196,6 +200,7 @@ class Recorder(Closing):
         if self._closed.is_set():
             return
         self._closed.set()
+        atexit.unregister(self.close)
         self._flusher.join()
         try:
             with self._writing():
