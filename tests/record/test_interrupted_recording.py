@@ -195,6 +195,7 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
     known = {**asdict(hello), "host_time_s": 1}
     of_region = {"row_mask": 1, "column_mask": 1, "adc_bits": 10, "slot_cycles": 0}
     region = {**head, "rows": 1, "columns": 1, "codes": [1] * 4, **of_region}
+    cell = {"host_time_s": 1, "rows": 1, "columns": 1}
     for topic, content, reason in (
         ("/camera", {}, "no recording of a skin"),
         ("/skin/mark", {"host_time_s": 1.0, "text": ""}, "no board says hello"),
@@ -214,6 +215,10 @@ def test_foreign_files(tmp_path: Path, path: Path, hello: Hello) -> None:
         ("/skin/mark", {"host_time_s": 10**400, "text": ""}, "too large"),
         ("/skin/force", {"host_time_s": 1, "force_n": -(10**400), "source": ""}, "too large"),
         ("/skin/tare", {**head, "rows": 1, "columns": 1, "rest_ratio": [10**400] * 4}, "range"),
+        *(
+            ("/skin/tare", {**cell, "rest_ratio": [0.5] * 3 + [ratio]}, "rest_ratio: one is not in")
+            for ratio in (float("nan"), 1e300, 1.01, -5, -0.01)
+        ),
         ("/skin/mark", {"host_time_s": 1, "text": "x" * 10_000}, "a message mark of 100"),
         (
             "/skin/scan",

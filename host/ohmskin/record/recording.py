@@ -402,6 +402,8 @@ def _message(name: str, octets: bytes) -> Recorded:
                 lines_of(values[mask], count)  # raises ValueError for lines beyond the skin
         if of_cells == "codes" and values["codes"].max() >> check_adc_bits(values["adc_bits"]):
             raise ValueError("codes: one is out of range")
+        if of_cells == "rest_ratio" and not np.all(abs(values[of_cells] - 0.5) <= 0.5):
+            raise ValueError("rest_ratio: one is not in 0..1")
     return KINDS[name](**values)
 
 
