@@ -428,6 +428,21 @@ def test_a_tare_is_recorded_with_the_mode_of_its_scans(tmp_path: Path) -> None:
     assert tare.mode == "far"
 
 
+def test_a_tare_of_whole_scans_in_between_has_their_mode(tmp_path: Path) -> None:
+    """Modes near and far have as many readings."""
+    bench = stepped("emulator://3x4")
+    bench.set_region(Region([1], mode="near", rate_hz=50, whole_every=4, whole_mode="far"))
+    with Recorder(tmp_path / "far.mcap", bench.info) as recorder:
+        record(bench, recorder, islice(bench, 20), tare_s=0.2)
+    found = load_recording(tmp_path / "far.mcap")
+    assert found.tares[0].mode == "far"
+    whole = [each for each in found.scans if each.is_whole]
+    assert whole
+    for each in whole:
+        assert found.tares[0].is_of(each)
+        np.testing.assert_allclose(found.tares[0].rest_ratio, each.ratio, atol=0.01)
+
+
 @pytest.fixture
 def recorded(path: Path) -> Path:
     rest, touched = (

@@ -253,6 +253,8 @@ def record(
             untouched.append(scan)
     finally:  # also if the scans end, or fail, during the tare
         if untouched:
-            recorder.add(Tare.of(mean_ratio(untouched), recorder.board, recorder.now_s()))
+            ratio = mean_ratio(untouched)
+            of = next(s for s in reversed(untouched) if s.is_whole and s.codes.shape == ratio.shape)
+            recorder.add(Tare(ratio, recorder.now_s(), of.mode))
     for scan in coming:
         keep(scan)

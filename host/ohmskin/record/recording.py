@@ -110,7 +110,7 @@ class Tare:
 
     @classmethod
     def of(cls, rest_ratio: Float, board: Hello, host_time_s: float) -> Self:
-        """A tare from mean readings of this board, of the mode that has as many readings a cell."""
+        """A tare from mean readings, of the first mode of this board that has as many a cell."""
         modes = (board.mode, board.whole_mode, *MODES)
         mode = next(name for name in modes if len(MODES[name]) == rest_ratio.shape[-1])
         return cls(rest_ratio, host_time_s, mode)
