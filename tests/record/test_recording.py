@@ -200,6 +200,21 @@ def test_the_record_loop(
         np.testing.assert_allclose(found.tares[0].rest_ratio, expected, rtol=1e-12)
 
 
+@pytest.mark.parametrize("how", ["stop", "configure"])
+def test_a_fast_replay_that_pauses_loses_nothing(path: Path, hello: Hello, how: str) -> None:
+    """Also the scan that was played before the pause, and that nobody had taken yet."""
+    write_recording(path, hello, scans := [scan(n) for n in range(4)])
+    with ohmskin.open(f"replay://{path}?speed=0") as skin:
+        found = [skin.latest()]
+        until(lambda: skin.stats.scans == 2)
+        if how == "stop":
+            skin.stop()
+        else:
+            with pytest.raises(CommandRefused):
+                skin.configure(rate_hz=10)
+        assert_same(found + [skin.latest() for _ in scans[1:]], scans, host_time=False)
+
+
 def test_replay_is_the_recording_bit_for_bit(path: Path, hello: Hello) -> None:
     scans = list(islice(stepped(f"{URL}&drop=0.05"), 300))
     assert any(each.missed for each in scans)

@@ -56,6 +56,13 @@ class Replay(Device):
         self._last: tuple[float, float] | None = None
         self._begin_thread(self._play, f"play {path}")
 
+    def start(self) -> None:
+        """Let it run. A scan that was played and that nobody has taken yet stays."""
+        with self._commands:
+            if not self._want_scans:
+                self._command("start")
+                self._want_scans = True
+
     def _command(self, name: str, **values: protocol.Value) -> None:
         """Start or stop.
 
