@@ -103,8 +103,8 @@ def gather(
                 settings = {"accuracy": clock, "rate_hz": 0}
                 evidence.clocks.append(_look(device, NOISE_S, settings))
         if presses is not None:
-            evidence.presses = presses
             for scan in scans_for(device, WAIT_S):
+                evidence.presses = presses  # here, because a recording that has ended has none
                 presses.take(scan)
                 if presses.done:
                     break

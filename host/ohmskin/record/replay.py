@@ -72,7 +72,7 @@ class Replay(Device):
             reason = f"{self.name} is a recording, which stays as it is"
             raise CommandRefused(name, "recorded", reason)
         with self._changed:
-            if self._failure is not None:
+            if self._failure is not None and not isinstance(self._failure, RecordingEnded):
                 raise self._failure
             self._running, self._last = name == "start", None
             self._changed.notify_all()
