@@ -414,12 +414,14 @@ def test_a_tare_is_the_rest_of_scans_of_its_mode_alone(
     far = replace(hello, mode="far")
     tares = [Tare(np.full((3, 4, 4), 0.25), 1.0), Tare(np.full((3, 4, 4), 0.75), 1.0, "far")]
     of_far = [replace(scan(n), mode="far") for n in (1, 2)]
-    write_recording(path, hello, [tares[0], scan(0), far, of_far[0], tares[1], of_far[1]])
+    between = [tares[0], scan(0), far, of_far[0], tares[1], of_far[1]]
+    write_recording(path, hello, [*between, hello, scan(3)])
     assert [each.mode for each in load_recording(path).tares] == ["near", "far"]
-    first, other, last = (each.rest_ratio for each in replayed(path))
+    first, other, last, again = (each.rest_ratio for each in replayed(path))
     assert other is None
     np.testing.assert_array_equal([first, last], [each.rest_ratio for each in tares])
-    export(path, tmp_path / "far.npz", begin_s=0.004)
+    assert again is first
+    export(path, tmp_path / "far.npz", begin_s=0.004, end_s=0.006)
     np.testing.assert_array_equal(load_readings(tmp_path / "far.npz").rest_ratio, last)
     write_recording(tmp_path / "near.mcap", far, [tares[0], *of_far])
     export(tmp_path / "near.mcap", tmp_path / "none.npz")

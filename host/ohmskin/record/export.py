@@ -28,7 +28,7 @@ from ohmskin.files import Closing, PathName, save_table, whole_file
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import MODES
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_FRAMES
-from ohmskin.record.recording import Mark, Tare, messages
+from ohmskin.record.recording import Mark, Tare, messages, tare_of
 
 FORMATS: Final = (".npz", ".csv")
 # Attributes of `Scan` that both formats have besides the readings, and their types.
@@ -143,7 +143,7 @@ class Part:
 
     def tare_of(self, scan: Scan) -> Tare | None:
         """The newest tare so far that is good for this scan; None if there is none."""
-        return next((tare for tare in reversed(self.tares) if tare.is_of(scan)), None)
+        return tare_of(scan, self.tares)
 
     def error(self, text: str) -> RecordingError:
         """An error whose remedy is to choose a smaller part: `text` ends before those options."""

@@ -38,7 +38,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, BinaryIO, Final, Self, TypeVar
 
@@ -119,6 +119,11 @@ class Tare:
         """Whether it is good for this scan: of the same cells, read at the same ends."""
         same_ends = self.mode == scan.mode or is_near((*MODES[self.mode], *scan.reading_names))
         return same_ends and self.rest_ratio.shape[:2] == scan.codes.shape[:2]
+
+
+def tare_of(scan: Scan, tares: Sequence[Tare]) -> Tare | None:
+    """The last of these tares that is good for this scan; None if there is none."""
+    return next((tare for tare in reversed(tares) if tare.is_of(scan)), None)
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,11 @@
 """A recording as a source of scans: ``replay://FILE.mcap?speed=1``.
 
 Scans come as they were recorded, with the same codes, numbers, board times and gaps. Each carries
-the tare that was in force (``rest_ratio``), if one of its mode was recorded before it. With speed 1
-they come at the pace at which they were recorded, with 2 twice as fast. With speed 0 they come as
-fast as they are taken: then nothing is lost however slow the reader is, and `latest` gives each in
-turn. Nothing is played before somebody first asks for scans. A pause longer than `LONGEST_PAUSE_S`
-is shortened to it.
+the tare that was in force (``rest_ratio``): the last before it that is good for it (`tare_of`).
+With speed 1 they come at the pace at which they were recorded, with 2 twice as fast. With speed 0
+they come as fast as they are taken: then nothing is lost however slow the reader is, and `latest`
+gives each in turn. Nothing is played before somebody first asks for scans. A pause longer than
+`LONGEST_PAUSE_S` is shortened to it.
 
 At the recording's end iterators end, and `latest` raises `RecordingEnded`. The commands start and
 stop let the replay run and pause; all others raise `CommandRefused`.
@@ -24,7 +24,7 @@ from ohmskin.link import protocol
 from ohmskin.link.device import QUEUE_SCANS, Device
 from ohmskin.link.messages import BoardStats, Hello, Scan
 from ohmskin.link.serial_port import READ_TIMEOUT_S
-from ohmskin.record.recording import Tare, messages
+from ohmskin.record.recording import Tare, messages, tare_of
 
 # Longest time between two scans of a replay. Chosen: shorter than `SILENCE_TIMEOUT_S`, after which
 # readers would take the board for lost.
@@ -87,19 +87,20 @@ class Replay(Device):
 
     def _play(self) -> None:
         """The work of the replay's thread: publish one message after the other, each when due."""
-        tare: Tare | None = None
+        tares: list[Tare] = []
         for message in self._messages:
             if isinstance(message, Hello | Scan) and not self._wait_for(message):
                 return
             match message:
                 case Scan():
-                    rest_ratio = tare.rest_ratio if tare and tare.is_of(message) else None
+                    tare = tare_of(message, tares)
+                    rest_ratio = None if tare is None else tare.rest_ratio
                     self._play_scan(replace(message, rest_ratio=rest_ratio))
                 case Hello():
                     self._check_unit(message)
                     self._hello = message
                 case Tare():
-                    tare = message
+                    tares.append(message)
         raise RecordingEnded(f"{self.name} has been played to its end")
 
     def _play_scan(self, scan: Scan) -> None:
