@@ -87,6 +87,9 @@ _HEAD: Final = struct.Struct("<BQ")
 _CHUNK: Final = struct.Struct("<16xQI")
 _CHANNEL_BYTES: Final = 4
 _MESSAGE_BYTES: Final = 22
+# A damaged chunk that ends in so many zeros, or is followed by them, is where a system crashed.
+# Chosen: a byte of the chunk, and the head of a record. No sound chunk ends in as many.
+_ZEROS: Final = 1 + _HEAD.size
 # Where in a message's record the time is at which it was logged [ns since 1970].
 _LOG_TIME: Final = slice(6, 14)
 _READ: Final = frozenset((Opcode.FOOTER, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK))
@@ -332,7 +335,12 @@ def _records(file: BinaryIO, allowance: _Allowance) -> Iterator[tuple[int, bytes
         if len(content) < size:
             return
         if opcode == Opcode.CHUNK:
-            yield from _unpacked(content, allowance)
+            try:
+                yield from _unpacked(content, allowance)
+            except (*_DAMAGE, ValueError):
+                if any((content[-_ZEROS:] + file.read(_HEAD.size))[-_ZEROS:]):
+                    raise
+                return  # those zeros begin in this chunk
         else:
             yield opcode, content
         if opcode == Opcode.FOOTER:
