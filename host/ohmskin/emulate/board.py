@@ -6,7 +6,10 @@ host, `advance` lets time pass and returns what was sent. `ohmskin.emulate.drive
 
 Not modelled:
 
-- the speed of the line: a scan's bytes come all at once at the scan's end, and none is dropped;
+- the speed of the line: a scan's bytes come all at once at the end of its period, and none is
+  dropped;
+- the end of the last scan: `stop` is answered at once, and the scan in progress never comes, where
+  a board ends it first;
 - EEPROM beyond the life of the object;
 - findings of the self-test, and its readings g and h: the board itself is sound (`SkinFaults` are
   faults of the skin).

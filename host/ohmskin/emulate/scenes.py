@@ -228,7 +228,7 @@ class Scene:
         return np.asarray(self.skin(time_s).cell_siemens - rest_siemens >= 1 / REST_OHM)
 
     def ratio(self, time_s: float, mode: str = "near") -> Float:
-        """Exact readings of a mode at a time, shape (rows, columns, 4)."""
+        """Exact readings of a mode at a time, shape (rows, columns, readings of the mode)."""
         if self.moves and time_s >= self.begin_s:
             return self.faults.readings(self.skin(time_s), mode)
         return self._still_ratio(self.begin_s if time_s >= self.begin_s else -1.0, mode)

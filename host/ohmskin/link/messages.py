@@ -192,8 +192,8 @@ class Scan:
     """The readings of a skin, or of a region of it, at one time.
 
     codes: ADC codes of `reading_names`, shape (rows, columns, readings); 0 where nothing was read.
-    number: of the scan since the board was started.
-    time_us: board time at the scan's start [us], from the board's start, without wraps.
+    number: of the scan since the command `start`; scans that the board dropped count.
+    time_us: when the scan began, since the board was switched on or reset [us], without wraps.
     host_time_s: `time.monotonic()` when the scan's last byte was read [s].
     missed: scans made since the one before this that never came: the board dropped them, or they
         were damaged on the way.
@@ -310,7 +310,7 @@ class BoardStats:
         were damaged on the line.
     board_rx_errors: damaged commands, as the board reports.
     unknown: valid frames whose type or size this host does not know.
-    restarts: times that the board restarted or was reset.
+    restarts: times that the board was reset while it scanned.
     overflowed: scans lost to iterators slower than the board.
     """
 
@@ -361,7 +361,7 @@ class BoardDecoder:
         # What the board was built from. Its hello says that, and comes first.
         self._definition = protocol.NOW
         self.stats = BoardStats(line=self._frames.stats)
-        # Number of the last scan. -1: none since the board was started; None: not known.
+        # Number of the last scan. -1: none since the command `start`; None: not known.
         self._number: int | None = None
         self._time_us = 0  # `Scan.time_us` of the last scan
         self._host_time_s: float | None = None  # and its `Scan.host_time_s`
@@ -403,19 +403,19 @@ class BoardDecoder:
         self._definition = definition
         hello = Hello(**layouts.today("hello", definition.frames["hello"].unpack(payload)))
         if not hello.scanning:
-            self._number = -1  # the next scan is the first since a start, with the number 0
+            self._number = -1  # the next scan is the first since `start`, with the number 0
         return hello
 
     def _scan(self, values: dict[str, Any], packed: bytes, host_time_s: float) -> Scan:
         codes = _codes(values, packed, self._definition.per_pass)
         number, dropped = values["scan"], values["dropped"]
         step = 1 if self._number is None else (number - self._number) % _NUMBER_SPAN
-        # A step above half of the span is one back: the board was started anew, and nobody saw it.
+        # A step above half of the span is one back: there was a `start` that nobody saw.
         if self._number is None or self._number < 0 or not 0 < step < _NUMBER_SPAN // 2:
-            # The first scan since a start. All before it are missed, unless the host came late.
+            # The first scan since `start`. All before it are missed, unless the host came late.
             missed = 0 if self._number is None else number
             self._dropped = dropped if self._number is None else 0
-            self._time_us = self._time_at_start(values["time_us"], host_time_s)
+            self._time_us = self._time_of_first(values["time_us"], host_time_s)
         else:
             missed = step - 1
             self._time_us += (values["time_us"] - self._time_us) % _TIME_SPAN_US
@@ -430,8 +430,8 @@ class BoardDecoder:
         of_scan = {name: values[name] for name in same}
         return Scan(codes, number, self._time_us, host_time_s, missed, **of_scan)
 
-    def _time_at_start(self, counter_us: int, host_time_s: float) -> int:
-        """Board time of the first scan since a start [us].
+    def _time_of_first(self, counter_us: int, host_time_s: float) -> int:
+        """Board time of the first scan since the command `start` [us].
 
         A board that was only stopped has the same clock as before, which may have wrapped several
         times meanwhile: of the times with this counter, the nearest to the one expected is taken.

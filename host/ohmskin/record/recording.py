@@ -179,8 +179,8 @@ _ORDER: Final = "row by row, in it column by column, all readings of each cell"
 SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     "hello": {"host_time_s": _HOST_TIME, **{f.name: _OF_TYPE[f.type] for f in fields(Hello)}},
     "scan": {
-        "number": _is("integer", "of the scan since the board was started"),
-        "time_us": _is("integer", "board time at the scan's start [us]"),
+        "number": _is("integer", "of the scan since the command start"),
+        "time_us": _is("integer", "board time at which the scan began [us]"),
         "host_time_s": _HOST_TIME,
         "missed": _is("integer", "scans before this one that never came"),
         "mode": _is("string", f"readings of each cell, by mode: {MODES}"),
