@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from itertools import islice, pairwise
 
 import pytest
+import serial
+from serial.rfc2217 import PortManager
 
 import ohmskin
 from ohmskin.emulate.board import EmulatedBoard
@@ -15,30 +17,38 @@ from ohmskin.emulate.faults import LineFaults
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import DeviceLost, PortError
 
+# pyserial's thread that reads the socket is made in the old way.
+pytestmark = pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")
+
 
 class Serving:
-    """An emulated board behind a socket of this machine, as socat serves one."""
+    """An emulated board behind a socket of this machine, as socat serves one, or ser2net."""
 
-    def __init__(self, board: EmulatedBoard) -> None:
+    def __init__(self, board: EmulatedBoard, scheme: str) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))
-        self.url = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
+        self.url = f"{scheme}://127.0.0.1:{self._server.getsockname()[1]}"
         self._board, self.ends = board, threading.Event()
+        self.port = serial.serial_for_url("loop://")  # whose speed a host sets
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
     def _serve(self) -> None:
         begin_s, faults = time.monotonic(), LineFaults()
         connection, _ = self._server.accept()
-        with connection:
+        with connection, connection.makefile("wb", 0) as writing:
             connection.settimeout(0.005)
+            manager = None
+            if self.url.startswith("rfc2217"):
+                manager = PortManager(self.port, writing)
             while not self.ends.is_set():
                 try:
                     if not (octets := connection.recv(4096)):
                         return
-                    self._board.receive(octets)
+                    self._board.receive(b"".join(manager.filter(octets)) if manager else octets)
                 except TimeoutError:
                     pass
-                connection.sendall(self._board.heard(faults, time.monotonic() - begin_s))
+                sent = self._board.heard(faults, time.monotonic() - begin_s)
+                connection.sendall(b"".join(manager.escape(sent)) if manager else sent)
 
     def close(self) -> None:
         self.ends.set()
@@ -46,9 +56,10 @@ class Serving:
         self._server.close()
 
 
-@pytest.fixture
-def serving() -> Iterator[Serving]:
-    served = Serving(emulated("emulator://8x8?scene=ghost&seed=1&begin=0&unit=7")[0])
+@pytest.fixture(params=["socket", "rfc2217"])
+def serving(request: pytest.FixtureRequest) -> Iterator[Serving]:
+    board = emulated("emulator://8x8?scene=ghost&seed=1&begin=0&unit=7")[0]
+    served = Serving(board, request.param)
     yield served
     served.close()
 
@@ -61,6 +72,13 @@ def test_a_board_behind_a_socket_is_a_board(serving: Serving) -> None:
     assert all(b.number == a.number + 1 for a, b in pairwise(scans))
     # What is waiting is taken at once, and not byte by byte.
     assert skin.stats.line.damaged == 0
+
+
+@pytest.mark.parametrize("serving", ["rfc2217"], indirect=True)
+def test_the_speed_of_a_port_elsewhere_is_set(serving: Serving) -> None:
+    with ohmskin.open(f"{serving.url}?baud=1000000") as skin:
+        skin.latest()
+        assert skin.info.baud == serving.port.baudrate == 1_000_000
 
 
 def test_a_connection_that_ends_is_a_board_that_is_gone(serving: Serving) -> None:

@@ -63,9 +63,11 @@ class SerialLink:
 
     def __init__(self, path: str, baud: int = protocol.CONSTANTS["baud_default"]) -> None:
         self.name = path
+        # pyserial refuses such a limit for rfc2217://: there, its socket has one of 5 s.
+        limit_s = None if path.startswith("rfc2217://") else _WRITE_TIMEOUT_S
         try:
             self._port = serial.serial_for_url(
-                path, baud, timeout=READ_TIMEOUT_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
+                path, baud, timeout=READ_TIMEOUT_S, write_timeout=limit_s, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as exc:
             raise PortUnusable(*_explain(path, exc)) from exc
