@@ -257,6 +257,29 @@ def test_a_lost_answer_is_asked_for_again() -> None:
                 assert skin.info.unit_id == unit_id
 
 
+class Lossy(SteppedLink):
+    """Loses the next `losses` commands."""
+
+    losses = 0
+
+    def write(self, octets: bytes) -> None:
+        if self.losses:
+            self.losses -= 1
+        else:
+            super().write(octets)
+
+
+def test_a_command_that_cannot_stop_the_board_lets_it_scan() -> None:
+    link = Lossy(emulated("emulator://4x4")[0])
+    with SteppedSkin(link) as skin:
+        scans = iter(skin)
+        link.losses = 3
+        with pytest.raises(DeviceLost, match="does not answer 'stop'"):
+            skin.configure(rate_hz=30)
+        link.board.reset()  # which a device that should scan gets over
+        assert len(list(itertools.islice(scans, 1000))) == 1000
+
+
 def test_refusals_on_a_bad_line_stay_refusals() -> None:
     with stepped("emulator://4x4?drop=0.1&bitflip=1e-4&seed=4") as skin:
         before = skin.info

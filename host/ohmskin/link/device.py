@@ -332,9 +332,9 @@ class Device(Closing):
         """Stop scanning for commands that a scanning board refuses, and go on however they end."""
         with self._commands:
             was_scanning = self._want_scans
-            if was_scanning:
-                self.stop()
             try:
+                if was_scanning:
+                    self.stop()
                 yield
             finally:
                 if was_scanning and self._failure is None:
