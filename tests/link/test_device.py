@@ -455,6 +455,17 @@ def test_slow_scans_are_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
         assert [scan.number for scan in take(iter(skin), 2)] == [0, 1]
 
 
+def test_a_slow_scan_is_no_reason_to_change_the_speed_of_the_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    link, speeds = stepped_link("emulator://16x16"), list[int]()
+    with SteppedSkin(link) as skin:
+        assert skin.configure(rate_hz=0, settle_us=3000).rate_hz < 1 / 3
+        monkeypatch.setattr(link, "set_baud", speeds.append)
+        assert len(take(iter(skin), 3)) == 3
+    assert not speeds
+
+
 def test_close_while_another_thread_waits() -> None:
     skin = ohmskin.open("emulator://1x1?rate=1")
     failures: list[BaseException] = []

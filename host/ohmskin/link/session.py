@@ -70,8 +70,9 @@ COMMAND_TIMEOUT_S = 1.0
 # A board that does not scan has answered in this time [s]. Chosen: five times what a USB bridge may
 # keep an answer.
 _ANSWER_S: Final = 0.1
-# A scanning board that sends no valid frame for so long is asked who it is. Chosen: a board that is
-# reset and left alone says hello within 2 s, and only what stays silent has to be asked.
+# A scanning board that sends no valid frame for so long, and for the time of a scan more, is asked
+# who it is. Chosen: a board that is reset and left alone says hello within 2 s, and only what stays
+# silent has to be asked.
 _SPEED_LOST_S = 2.5
 # A silent board is asked again after so long. Chosen: the Mega's boot loader, if it took the
 # question for an upload, waits for 5 s (see `ATTEMPTS_AFTER_RESET`), and then the firmware starts.
@@ -214,7 +215,8 @@ class Session(Device):
             if messages:
                 self._heard_s = now_s
                 self._changed.notify_all()
-        if self._want_scans and now_s - self._heard_s > _SPEED_LOST_S:
+        silent_s = now_s - self._heard_s
+        if self._want_scans and silent_s > _SPEED_LOST_S + 1 / self.info.rate_hz:
             # A board that was reset is back at its default speed, at which its hello was not
             # understood.
             self._heard_s = now_s + _ASK_AGAIN_S - _SPEED_LOST_S
