@@ -135,6 +135,14 @@ def test_a_column_is_named_or_numbered() -> None:
         assert decoder.damaged == 6
 
 
+def test_the_first_line_may_be_the_only_header() -> None:
+    """So it is where opening the port resets an Arduino. A part of a header names no place."""
+    lines = b"\r\n0.1,1,2,-3.5\r\n"
+    assert ForceLineDecoder(column="Fz").feed(b"time_s,Fx,Fy,Fz" + lines) == [-3.5]
+    for part in (b"Fy,Fz", b"z", b"x,Fy,Fz"):
+        assert ForceLineDecoder(column="Fz").feed(part + lines) == []
+
+
 def test_the_first_line_may_be_a_part_and_counts_for_nothing() -> None:
     decoder = ForceLineDecoder()
     assert decoder.feed(b"x" * 1000) == []

@@ -69,8 +69,8 @@ class ForceLineDecoder:
     column: which field of a line has the force: its name in a header, or its number from 1; "": the
         only field, or the second of two.
 
-    What comes before the first end of a line is dropped, because it may be the last part of a
-    number. No more than `LARGEST_LINE_BYTES` are held, whatever comes.
+    What comes before the first end of a line is dropped, unless it is a header, because it may be
+    the last part of a number. No more than `LARGEST_LINE_BYTES` are held, whatever comes.
 
     damaged: how many lines had no force that could be read; blank lines and headers do not count.
     last_damaged: the newest of these lines, cut to some characters.
@@ -100,7 +100,8 @@ class ForceLineDecoder:
         *lines, self._partial = re.split(rb"[\r\n]", self._partial + octets)
         for each in lines:
             line = each[: self.LARGEST_LINE_BYTES + 1].decode("ascii", "replace")
-            if line.strip() and not self._skips and not self._is_header(line):
+            # The first line is a header where opening the port resets the sensor.
+            if line.strip() and not self._is_header(line) and not self._skips:
                 force_n = self._force_n(line) if len(line) <= self.LARGEST_LINE_BYTES else math.inf
                 if math.isfinite(force_n):
                     forces_n.append(force_n)
