@@ -100,12 +100,30 @@ def test_another_line_is_counted_and_the_next_is_read(line: bytes) -> None:
 def test_two_numbers_may_be_one_with_a_decimal_comma() -> None:
     """The first of them is a time only if it rises as a time does."""
     decoder = ForceLineDecoder()
-    assert decoder.feed(b"\n0,02\n0,01\n0,02\n1,35\n3,50\n3,51\n0,2\n") == []
-    assert decoder.damaged == 7
-    assert decoder.feed(b"100,8421\n110,8422\n120,8423\n130,-2\n140,8425\n") == [-2.0]
-    assert decoder.damaged == 11
-    lines = b"".join(b"%d,%d\n" % (150 + 10 * n, n) for n in range(10))
-    assert decoder.feed(lines) == [2, 3, 4, 5, 6, 7, 8, 9]
+    lines = b"".join(b"%d,%d\n" % (150 + 10 * n, n) for n in range(12))
+    assert decoder.feed(b"\n" + lines) == [8, 9, 10, 11]
+    assert decoder.damaged == 8
+    assert decoder.feed(b"1,8421\n3,-2\n4,8425\n") == [-2]  # the sensor was reset
+    lines = b"".join(b"%d,%d\n" % (5 + n, n) for n in range(120))
+    assert decoder.feed(lines) == list(range(105, 120))
+
+
+@pytest.mark.parametrize("unit", ["", " g"])
+def test_presses_on_a_scale_with_a_decimal_comma_are_no_times(unit: str) -> None:
+    """Each lasts for 60 lines, with a pause before and after it."""
+    cycles = np.random.default_rng(1).normal(0.5, 0.3, (20, 100))
+    cycles[:, 20:80] += np.minimum(10.4 * np.arange(60), 550)
+    numbers = [f"{grams:.1f}{unit}\n".replace(".", ",") for grams in cycles.ravel()]
+    decoder = ForceLineDecoder(unit="g")
+    assert decoder.feed(("\n" + "".join(numbers)).encode()) == []
+    assert decoder.damaged == 2000
+
+
+def test_a_number_with_a_unit_is_no_time_and_force() -> None:
+    """As of a scale that is pressed already when it is opened."""
+    decoder = ForceLineDecoder()
+    assert decoder.feed(b"\n" + b"".join(b"%d,1 g\n" % (100 + n) for n in range(50))) == []
+    assert decoder.damaged == 50
 
 
 def test_a_scale_that_leaves_the_unit_out_is_not_guessed() -> None:

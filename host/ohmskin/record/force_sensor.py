@@ -54,9 +54,13 @@ _OF_SCALE: Final = re.compile(rf"\s*{_STATE}{_NUMBER}(?:[\s,]*{_UNIT})?[\s?]*", 
 _COMMAS: Final = re.compile(r"[,;\t]")
 # Two numbers with a comma between them that may be one number with a decimal comma.
 _DECIMAL_COMMA: Final = re.compile(r"[-+\s]*\d+,\d+[^.\d]*")
-# They are taken for a time and a force once the first of them has risen so often without a break.
-# Chosen: the whole part of a force does not rise so often, not even while somebody presses.
+# They are taken for a time and a force once the first of them has risen so often. A number that has
+# a unit is never such a force. Chosen: as long as nobody presses, the whole part of a force does
+# not rise so often.
 _RISES_OF_TIME: Final = 8
+# Where the first of them does not rise, as a time where the sensor is reset, so many rises more are
+# needed. Chosen: a force that is pressed and let go rises more seldom for each time that it falls.
+_RISES_OF_BREAK: Final = 100
 # An error shows so many characters of a line. Chosen: enough to recognise the line.
 _SHOWN_CHARS: Final = 40
 
@@ -89,8 +93,9 @@ class ForceLineDecoder:
         self._place = int(column) - 1 if column.isdecimal() else -1  # -1: no header has come
         self._fields = 0  # how many fields lines have; 0: none has come
         self._is_stated = False  # whether a line has stated its unit
-        # The first number of the last line, if it may be a time, and how often it has risen.
-        self._time, self._rises = math.inf, 0
+        # The first number of the last line, if it may be a time, and how often it has risen; below
+        # 0: how many rises more it takes to make good what did not rise.
+        self._time, self._rises = -math.inf, -1
         self._partial = b""
         self._skips = True  # what comes until this line ends: the line is the first, or too long
 
@@ -156,10 +161,11 @@ class ForceLineDecoder:
         if time is None or time["unit"] or len(others) != 1:
             return None
         time_s = float(time["number"].replace(" ", ""))
-        self._rises = self._rises + 1 if time_s > self._time else 0
+        rises = time_s > self._time
+        self._rises = self._rises + 1 if rises else min(self._rises, 0) - _RISES_OF_BREAK
         self._time = time_s
-        unsure = _DECIMAL_COMMA.fullmatch(line) and self._rises < _RISES_OF_TIME
-        return None if unsure else others[0]
+        is_time = self._rises >= _RISES_OF_TIME and others[0] and not others[0]["unit"]
+        return None if _DECIMAL_COMMA.fullmatch(line) and not is_time else others[0]
 
 
 class ForceSensor(Closing):
