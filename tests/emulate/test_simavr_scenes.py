@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Boards of the AVR simulator that are opened by a URL: their scenes, EEPROM and leads."""
 
+import os
+import signal
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 import ohmskin
+from command_line import Command
 from ohmskin.circuit.skin import readings
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.errors import PortError
@@ -85,6 +88,17 @@ def test_the_simulator_keeps_its_eeprom_in_a_file(tmp_path: Path) -> None:
     ):
         with pytest.raises(PortError, match=reason):
             ohmskin.open(wrong)
+
+
+def test_ctrl_c_keeps_the_simulator_s_eeprom(tmp_path: Path, command: Command) -> None:
+    """A terminal sends it to all processes that a command has started."""
+    path = tmp_path / "board.eeprom"
+    process = command("stream", f"simavr://uno?eeprom={path}", start_new_session=True)
+    assert process.stdout is not None
+    process.stdout.readline()
+    os.killpg(process.pid, signal.SIGINT)
+    process.communicate()
+    assert path.stat().st_size == 1024
 
 
 @pytest.mark.parametrize("lines", ["", "&line_pf=1"])

@@ -77,8 +77,12 @@ class SkinSim(Closing):
         options += bool(pins) * ["--pins", pins]
         command = [str(PROGRAM), "--board", board, *options, str(elf)]
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (close() closes it)
+        # Ctrl-C, which a terminal sends to its whole session, is for this program alone. The
+        # simulator ends when its pipes are closed, which also happens when this program is killed.
         pipe = subprocess.PIPE
-        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._stderr)
+        self._process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=self._stderr, start_new_session=True
+        )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._requests, self._replies = self._process.stdin, self._process.stdout
