@@ -70,6 +70,13 @@ def test_bad_requests_are_refused(simulate: Simulate) -> None:
     assert sim.stats()["state"] == "running"
 
 
+def test_a_request_that_is_refused_takes_the_replies_of_those_after_it(simulate: Simulate) -> None:
+    sim = simulate(FOREVER)
+    with pytest.raises(SimulationError, match="tau"):
+        sim.requests(("O", b"tau=1"), ("S", b""), ("E", b""))
+    assert len(sim.request("E")) == 1024
+
+
 @pytest.mark.parametrize(
     ("sent", "ops"), [(b"W\xff\xff\xff\xff", b"!"), (b"S\x00", b""), (b"Q" + bytes(4), b"Q")]
 )

@@ -140,7 +140,15 @@ class SkinSim(Closing):
                 self._requests.flush()
             except BrokenPipeError:
                 raise self._death() from None
-            return [self._reply(op) for op, _ in of]
+            replies, refusals = list[bytes](), list[SimulationError]()
+            for op, _ in of:  # all are read before one raises: none is left for the next request
+                try:
+                    replies.append(self._reply(op))
+                except SimulationError as exc:
+                    refusals.append(exc)
+            if refusals:
+                raise refusals[0]
+            return replies
 
     def _reply(self, op: str) -> bytes:
         reply_op, length = _HEADER.unpack(self._read(_HEADER.size))
