@@ -3,6 +3,8 @@
 
 import os
 import signal
+import time
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -14,6 +16,7 @@ import ohmskin
 from command_line import Command
 from ohmskin.circuit.skin import readings
 from ohmskin.emulate.scenes import BEGIN_S, Scene
+from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.errors import PortError
 from ohmskin.link.codes import quantise
 from ohmskin.link.device import Device
@@ -54,6 +57,20 @@ def test_the_simulator_says_which_forces_a_scan_has_read() -> None:
             same_skin.put(((0, 0), now[0, 0]))  # the robot presses this cell for 4 s
             np.testing.assert_allclose(scan.codes, quantise(same_skin.ratio(0.0)), rtol=0, atol=1)
     assert len(peaks_n) > 2
+
+
+def test_what_a_scan_has_read_can_be_asked_while_the_skin_moves() -> None:
+    """The thread of a session reads meanwhile."""
+
+    class Meanwhile(float):
+        def __ge__(self, other: float) -> bool:
+            time.sleep(0.03)  # longer than a skin is shown
+            link.read()
+            return super().__ge__(other)
+
+    with closing(SimavrLink("uno", Scene("moving", begin_s=0.0))) as link:
+        assert link.scene_s(Meanwhile(9.0)) >= 0.0
+        assert link.scene_s(Meanwhile(-1.0)) == 0.0
 
 
 def test_a_weight_can_be_put_on_a_simulated_skin() -> None:

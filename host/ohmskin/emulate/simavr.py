@@ -225,7 +225,7 @@ class SimavrLink(SerialLink):
 
     def scene_s(self, time_s: float) -> float:
         """The scene's time that the skin has at a time of the board [s]: it changes in steps."""
-        shown = reversed(self._shown_s)
+        shown = reversed(tuple(self._shown_s))  # the thread that reads may add to it meanwhile
         return next((scene_s for since_s, scene_s in shown if since_s <= time_s), 0.0)
 
     def read(self) -> bytes:
