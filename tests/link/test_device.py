@@ -222,6 +222,14 @@ def test_refused_values_change_nothing(url: str) -> None:
         assert asdict(skin.info) == before
 
 
+def test_an_accuracy_and_modes_may_be_numbers() -> None:
+    with stepped("emulator://4x4") as skin:
+        assert skin.configure(accuracy=1).accuracy == "fine"  # type: ignore[arg-type]
+        assert skin.set_region(device.Region([0], mode=2)).mode == "half"  # type: ignore[arg-type]
+        assert skin.latest().mode == "half"
+        assert skin.stats.restarts == 0
+
+
 def test_stop_and_start(url: str) -> None:
     with ohmskin.open(url, start=False) as skin:
         time.sleep(0.1)
@@ -547,6 +555,14 @@ def test_a_board_that_says_what_cannot_be_while_it_scans() -> None:
         link.board.reset()
         with pytest.raises(ProtocolError, match="hello says scan_cycles 0"):
             list(scans)
+
+
+def test_a_board_that_never_scans_as_told() -> None:
+    says = {"rate_asked_mhz": 1000}
+    with stepped(EmulatedBoard(Scene().ratio, BoardSettings(), says=says)) as skin:
+        skin.configure(rate_hz=30)
+        with pytest.raises(DeviceLost, match="does not keep how it was told to scan"):
+            skin.latest()
 
 
 def test_scans_of_another_size_than_hello_says() -> None:

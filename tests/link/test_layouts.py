@@ -39,8 +39,8 @@ def hello_fields() -> dict[str, Any]:
     return fields | {"reset_cause": tuple(fields["reset_cause"]), "scan_cycles": 256 * 689}
 
 
-def hello_wire() -> bytes:
-    return framing.encode(old("hello").id, 0, old("hello").pack(**hello_fields()))
+def hello_wire(**says: Any) -> bytes:
+    return framing.encode(old("hello").id, 0, old("hello").pack(**hello_fields() | says))
 
 
 class OldBoard:
@@ -51,14 +51,18 @@ class OldBoard:
     def __init__(self) -> None:
         self._decoder, self._out = framing.Decoder(), SimpleQueue[bytes]()
         self.heard: list[tuple[str, dict[str, Any]]] = []
+        self._says: dict[str, Any] = {}
 
     def write(self, octets: bytes) -> None:
         frames = protocol.definition(BEFORE).frames_by_id
         for raw in self._decoder.feed(octets):
             frame = frames[raw.type]
             self.heard.append((frame.name, frame.unpack(raw.payload)))
+            if frame.name == "configure":
+                asked = {"rate_mhz": "rate_asked_mhz", "settle_us": "settle_asked_us"}
+                self._says = {asked.get(name, name): v for name, v in self.heard[-1][1].items()}
             if frame.name == "get_hello":
-                self._out.put(hello_wire())
+                self._out.put(hello_wire(**self._says))
             answer = {"command": raw.type, "command_sequence": raw.sequence, "result": "ok"}
             self._out.put(framing.encode(old("ack").id, 0, old("ack").pack(**answer)))
             if frame.name == "start":

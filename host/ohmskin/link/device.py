@@ -210,7 +210,10 @@ class Device(Closing):
         return mean_ratio(scans_for(self, seconds))
 
     def start(self) -> None:
-        """Start scanning. Does nothing when the device scans already."""
+        """Start scanning. Does nothing when the device scans already.
+
+        :raises DeviceLost: the board went away, or does not scan as it was told.
+        """
         with self._commands:
             if self._want_scans:
                 return
@@ -224,6 +227,9 @@ class Device(Closing):
                 if self._is_as_wanted():
                     break
                 self._command("stop")
+            else:
+                problem = f"{self.name} does not keep how it was told to scan"
+                raise DeviceLost(problem, "unplug and plug it again")
             self._want_scans = True
 
     def stop(self) -> None:
@@ -275,7 +281,7 @@ class Device(Closing):
     def _configure(self, wanted: dict[str, protocol.Value]) -> Hello:
         with self._paused():
             self._command("configure", **wanted)
-            self._wanted = wanted
+            self._wanted = _as_said(wanted)
             self._refresh()
             self._restore()
             return self.info
@@ -293,7 +299,7 @@ class Device(Closing):
         with self._commands:
             asked = region.fields(self.info)
             self._command("set_region", **asked)
-            self._wanted = configuration(self.info) | asked
+            self._wanted = _as_said(configuration(self.info) | asked)
             return self._refresh()
 
     def set_unit_id(self, unit_id: int) -> None:
@@ -428,13 +434,18 @@ class Device(Closing):
         return ready()
 
 
-_CONFIGURE: Final = tuple(field.name for field in protocol.FRAMES["configure"].fields)
+_CONFIGURE: Final = protocol.FRAMES["configure"]
+
+
+def _as_said(asked: dict[str, protocol.Value]) -> dict[str, protocol.Value]:
+    """The fields of `configure` as a hello says them: names, where a program gave their numbers."""
+    return _CONFIGURE.unpack(_CONFIGURE.pack(**asked))
 
 
 def configuration(board: Hello) -> dict[str, protocol.Value]:
     """The fields of the command `configure` that make a board scan as this one does."""
     asked = {"rate_mhz": board.rate_asked_mhz, "settle_us": board.settle_asked_us}
-    same = (name for name in _CONFIGURE if name not in asked)
+    same = (field.name for field in _CONFIGURE.fields if field.name not in asked)
     return asked | {name: getattr(board, name) for name in same}
 
 
