@@ -212,6 +212,13 @@ def test_a_board_that_stops_talking() -> None:
             skin.set_unit_id(1)
 
 
+def test_a_conversion_that_was_late_long_ago_is_no_reason_for_silence() -> None:
+    link = stepped_link("emulator://2x2?stall=600")
+    link.board.says["late"] = 1
+    with SteppedSkin(link) as skin, pytest.raises(DeviceLost, match="said nothing"):
+        list(skin)
+
+
 def test_a_port_with_other_things_to_say(
     monkeypatch: pytest.MonkeyPatch, silent_port: tuple[int, str]
 ) -> None:

@@ -31,8 +31,8 @@ SILENCE_TIMEOUT_S: Final = 5.0
 # So many scans are kept for an iterator that is slower than the board. Chosen: 11 s at 90 Hz, which
 # is longer than a program's pause for a file or a picture.
 QUEUE_SCANS: Final = 1024
-# A command is sent so often before the board counts as lost. Chosen: a line that damages one frame
-# in a hundred loses three in a row once in a million.
+# A command is sent so often before the board counts as lost. Chosen: where a line damages one frame
+# in a hundred, one command in fifty, or its answer, is lost, and three in a row are 8 in a million.
 COMMAND_TRIES: Final = 3
 _S = TypeVar("_S", bound=Scan)
 
@@ -118,6 +118,7 @@ class Device(Closing):
         # Held while commands that belong together are done, such as stop, configure and start.
         self._commands = threading.RLock()
         self._want_scans = False
+        self._late_before = 0  # what the board counted as late when scanning began
         # The fields of the last `configure`, which a board that is reset forgets.
         self._wanted: dict[str, protocol.Value] | None = None
         self._publisher: threading.Thread | None = None
@@ -195,7 +196,8 @@ class Device(Closing):
     def _wait_for_scan(self, ready: Callable[[], bool], limit_s: float | None = None) -> None:
         limit_s = SILENCE_TIMEOUT_S + 2 / self.info.rate_hz if limit_s is None else limit_s
         if not self._wait(ready, limit_s):
-            if late := self.info.late:  # a silent board has been asked for its hello
+            # A silent board has been asked for its hello. After a reset, it counts from 0 again.
+            if (late := self.info.late) not in (0, self._late_before):
                 silent = f"{self.name} has sent no scan for {limit_s:.1f} s"
                 raise DeviceLost(f"{silent}: {late} conversions late", "ask for a lower rate")
             silent = f"{self.name} has said nothing for {limit_s:.1f} s"
@@ -230,6 +232,7 @@ class Device(Closing):
             else:
                 problem = f"{self.name} does not keep how it was told to scan"
                 raise DeviceLost(problem, "unplug and plug it again")
+            self._late_before = self.info.late
             self._want_scans = True
 
     def stop(self) -> None:

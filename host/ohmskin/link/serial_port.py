@@ -135,7 +135,7 @@ class SerialPort:
 
     path: what opens it.
     description: what the system calls it, ``""`` if nothing.
-    board: what is probably behind it, a name of the enum `board`; ``""`` if nothing tells.
+    board: what is probably behind it, as `Hello.board` names it; ``""`` if nothing tells.
     """
 
     path: str
