@@ -187,6 +187,65 @@ READS: dict[str, Callable[[ohmskin.Device], object]] = {
 }
 
 
+@pytest.mark.parametrize("asked", [{"rate_hz": 30.0}, {"rows": 4}])
+@pytest.mark.parametrize("losses", [1, 2, 3])
+def test_a_reset_board_scans_as_before_where_commands_are_lost(
+    asked: dict[str, float], losses: int
+) -> None:
+    """The first of those that bring it back: configure, start and get_hello."""
+    link = Lossy(emulated("emulator://8x8")[0])
+    with SteppedSkin(link) as skin:
+        kept = skin.configure(**asked)
+        scans = iter(skin)
+        before = next(scans)
+        link.losses = losses
+        link.board.reset()
+        found = list(itertools.islice(scans, 20))
+        assert skin.stats.restarts >= 1
+        assert skin.info.rate_hz == kept.rate_hz
+    assert {scan.codes.shape for scan in found} == {before.codes.shape}
+    steps_s = np.diff([1e-6 * scan.time_us for scan in found])
+    np.testing.assert_allclose(steps_s, 1 / kept.rate_hz, rtol=1e-3)
+
+
+def test_a_board_that_comes_in_place_of_another_says_what_it_is() -> None:
+    """Behind an adapter that stays plugged, as another board may."""
+    link = stepped_link("emulator://8x8")
+    with SteppedSkin(link) as skin:
+        scans = iter(skin)
+        next(scans)
+        link.board.says |= {"ref_top_ohm": 10_000, "unit_id": 9}
+        link.board.reset()
+        after = list(itertools.islice(scans, 3))[-1]
+        assert (skin.info.unit_id, skin.info.ref_top_ohm) == (9, 10_000)
+        assert after.board == skin.info
+
+
+def test_a_reset_board_that_cannot_scan_as_before_is_lost() -> None:
+    """As where the faster line is gone, and the slower one cannot keep up."""
+    link = stepped_link("emulator://8x8")
+    with SteppedSkin(link) as skin:
+        skin.configure(rate_hz=30)
+        scans = iter(skin)
+        next(scans)
+        link.board.says["rate_asked_mhz"] = 90_000
+        link.board.reset()
+        with pytest.raises(DeviceLost, match="was reset and cannot scan as before"):
+            list(itertools.islice(scans, 100))
+        assert skin.stats.restarts == 1
+
+
+def test_two_hellos_of_one_reset_are_one_restart() -> None:
+    link = stepped_link("emulator://8x8")
+    with SteppedSkin(link) as skin:
+        scans = iter(skin)
+        next(scans)
+        link.board.reset()
+        link.write(framing.encode(protocol.FRAMES["get_hello"].id, 0, b""))
+        assert [scan.number for scan in itertools.islice(scans, 3)] == [0, 1, 2]
+        assert skin.stats.restarts == 1
+
+
 @pytest.mark.parametrize("use", READS)
 def test_a_serial_port_that_goes_away(use: str, pty_board: Serve) -> None:
     server = pty_board("emulator://2x2?rate=300")

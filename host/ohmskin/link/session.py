@@ -77,6 +77,9 @@ _SPEED_LOST_S = 2.5
 # A silent board is asked again after so long. Chosen: the Mega's boot loader, if it took the
 # question for an upload, waits for 5 s (see `ATTEMPTS_AFTER_RESET`), and then the firmware starts.
 _ASK_AGAIN_S = 6.5
+# A board that was reset has said how it scans in this time [s], or it is told again how to. Chosen:
+# as long as an answer of `ATTEMPTS` may take.
+_BACK_S: Final = 0.3
 # A board has taken its new speed this long after its answer came. Chosen: a command that came too
 # early would be lost, and the next one would come after the board has returned to its old speed.
 _SPEED_CHANGE_S: Final = 0.02
@@ -111,6 +114,10 @@ class Session(Device):
         self._sequence = 0  # number of the last command
         self._clock = ScanClock(time.time_ns() - round(1e9 * self.now_s))
         self._heard_s = self.now_s  # when a valid frame last came
+        # A board that was reset is told how to scan. Until its hello says that it does so, its
+        # scans count for nothing. When it is told again [s]; None: it scans as it should.
+        self._tell_s: float | None = None
+        self._misfits = 0  # how often its hello has said that it scans otherwise
         self._begin_thread(self._read, f"read {self.name}")
         try:
             self._connect()
@@ -210,6 +217,8 @@ class Session(Device):
         now_s = self.now_s
         with self._changed:
             messages = self._decoder.feed(octets, now_s)
+            if not self._want_scans:
+                self._tell_s = None
             for message in messages:
                 self._keep(message, now_s)
             if messages:
@@ -233,6 +242,9 @@ class Session(Device):
         match message:
             case Hello() if odd := message.impossible():
                 raise ProtocolError(f"{self.name}: hello says {odd}, which cannot be", _BROKEN)
+            case Scan() if self._tell_s is not None:
+                if now_s >= self._tell_s:  # the answer was lost
+                    self._bring_back(now_s)
             case Scan() if self._want_scans and _size(message) != _size(self.info):
                 said = f"{_size(self.info)} cells, its scans have {_size(message)}"
                 raise ProtocolError(f"{self.name}: hello says {said}", _BROKEN)
@@ -249,16 +261,40 @@ class Session(Device):
             case SelfTestReport():
                 self._report = message
             case Hello() if self._want_scans and not message.scanning:
-                # It was reset: bring it back to where it was. Nothing waits for answers, because
-                # this is the thread that reads them.
-                self._stats.restarts += 1
-                LOG.warning("%s: was reset (%s)", self.name, ", ".join(message.reset_cause))
-                self._send("configure", **configuration(self.info))
-                news = ("unit_id", "baud", "settings", "reset_cause")
-                self._hello = replace(self.info, **{n: getattr(message, n) for n in news})
-                self._send("start")
+                if self._tell_s is None:
+                    self._stats.restarts += 1
+                    LOG.warning("%s: was reset (%s)", self.name, ", ".join(message.reset_cause))
+                    news = ("unit_id", "baud", "settings", "reset_cause")
+                    self._hello = replace(self.info, **{n: getattr(message, n) for n in news})
+                    self._misfits = 0
+                if self._tell_s is None or now_s >= self._tell_s:
+                    self._bring_back(now_s)
+            case Hello() if self._tell_s is not None and configuration(message) != self._aim:
+                self._misfits += 1
+                if self._misfits == COMMAND_TRIES:
+                    problem = f"{self.name} was reset and cannot scan as before"
+                    raise DeviceLost(problem, "open it again, or ask for a lower rate")
+                self._bring_back(now_s)
             case Hello():
                 self._hello = message
+                self._tell_s = None
             case ForeignHello():
                 both = f"0x{message.layout_crc:04X}, this host 0x{protocol.LAYOUT_CRC:04X}"
                 raise ProtocolMismatch(f"{self.name}: board speaks layout {both}", _FLASH)
+
+    @property
+    def _aim(self) -> dict[str, protocol.Value]:
+        """The fields of `configure` that the board should scan by."""
+        return self._wanted or configuration(self.info)
+
+    def _bring_back(self, now_s: float) -> None:
+        """Tell a board that was reset to scan as before, and ask how it scans.
+
+        Nothing waits for answers, because this is done by the thread that reads them.
+        """
+        if self._tell_s is not None:  # it may scan already
+            self._send("stop")
+        self._send("configure", **self._aim)
+        self._send("start")
+        self._send("get_hello")
+        self._tell_s = now_s + _BACK_S
