@@ -17,15 +17,18 @@ from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import DeviceLost, TareRefused
-from ohmskin.estimate.knowledge import NO_WIRES
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS
-from ohmskin.estimate.prior import UNKNOWN_LAYER_STD
+from ohmskin.estimate.prior import LAYER_STD
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
+from ohmskin.link.codes import quantise
+from ohmskin.link.messages import Scan
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Tare, load_recording
 from recordings import write_recording
 from stepped import stepped, stepped_link
+from studies.trials import random_trial
 
 GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 Record = Callable[[int, int], str]
@@ -123,19 +126,50 @@ def test_tare_is_refused_while_something_touches_the_skin() -> None:
             board.undo_tare()
 
 
+def taught(scans: int = 30) -> tuple[SkinReader, list[Scan]]:
+    """A reader of a skin whose wires nobody has told, and scans of touches that teach them."""
+    trial = random_trial(8, 8, 6, scans, seed=2).rounded(10)
+    (scan,) = islice(stepped("emulator://8x8"), 1)
+    untold = replace(calibration(trial.rest_ratio), nominal_wire_ohm=NO_WIRES)
+    reader = SkinReader(stepped("emulator://8x8").info, untold)
+    return reader, [replace(scan, codes=quantise(ratio, 10)) for ratio in trial.ratio]
+
+
 def test_wires_that_a_session_has_taught_are_kept(tmp_path: Path) -> None:
-    untold = replace(of_scene("multi", method="joint"), nominal_wire_ohm=NO_WIRES)
-    with ohmskin.open("emulator://8x8?scene=multi&begin=0&seed=1", calibration=untold) as board:
-        assert board.calibration.nominal_wire_ohm == NO_WIRES
-        assert len(list(islice(board, 5))) == 5
-        board.calibration.save(tmp_path / "skin.json")
+    reader, scans = taught()
+    assert told_wires(reader) == NO_WIRES
+    assert [reader.read(scan) for scan in scans][-1].estimate.wires == "learned"
+    assert reader.calibration is not None
+    reader.calibration.save(tmp_path / "skin.json")
     kept = load_calibration(tmp_path / "skin.json").nominal_wire_ohm
     assert kept.both is not None
     stds = kept.top_log_std, kept.bottom_log_std
     for ohm, true_ohm, std in zip(kept.both, (TOP_WIRE_OHM, BOTTOM_WIRE_OHM), stds, strict=True):
         assert std is not None
-        assert std < UNKNOWN_LAYER_STD
+        assert std < LAYER_STD
         assert abs(np.log(ohm / true_ohm)) < 3 * std
+
+
+@pytest.mark.parametrize(
+    "told",
+    [NO_WIRES, WireOhm(100.0, 200.0), WireOhm(150.0, 150.0, 100.0, 0.06, 0.06, 20.0)],
+)
+def test_a_tare_leaves_the_wires_as_they_were_told(told: WireOhm) -> None:
+    """Wires of a factor of two counted as measured; those of 6 % as of 52 % after three tares."""
+    bench = stepped("emulator://8x8?scene=multi&begin=0&seed=1")
+    reader = SkinReader(bench.info, replace(of_scene("rest"), nominal_wire_ohm=told))
+    scans = list(islice(bench, 5))
+    for scan in scans:
+        reader.read(scan)
+    reader.tare(scans[-1].ratio, force=True)
+    reader.read(scans[-1])
+    assert told_wires(reader) == told
+
+
+def told_wires(reader: SkinReader) -> WireOhm:
+    """The wires that a session would keep."""
+    assert reader.calibration is not None
+    return reader.calibration.nominal_wire_ohm
 
 
 def test_tare_follows_a_drift(tmp_path: Path) -> None:

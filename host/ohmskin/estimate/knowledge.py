@@ -20,7 +20,7 @@ from ohmskin.circuit.skin import (
     current_std,
     is_near,
 )
-from ohmskin.estimate.prior import LEAD_STD, UNKNOWN_LEAD_OHM
+from ohmskin.estimate.prior import LAYER_STD, LEAD_STD, UNKNOWN_LEAD_OHM, USUAL_LEAD_STD_OHM
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import MODES
@@ -68,6 +68,25 @@ class WireOhm(NamedTuple):
         if self.lead is None:
             return UNKNOWN_LEAD_OHM, std_ohm
         return self.lead, self.lead_std_ohm or LEAD_STD * self.lead
+
+    def or_surer(self, found: "WireOhm") -> "WireOhm":
+        """These wires; the layers of `found`, or its lead, where it knows them much more surely.
+
+        A method expects that layers have changed by `LAYER_STD` since they were told. So what it
+        has found counts only where its deviations are below half of those that were told, or of
+        `LAYER_STD`. Where nobody has told layers, it counts from `LAYER_STD` on (`Estimate.wires`).
+        """
+
+        def surer(found_std: float | None, told_std: float) -> bool:
+            return found_std is not None and found_std < told_std
+
+        limit, better = LAYER_STD if self.both is None else 0.5 * LAYER_STD, self
+        told_stds = (limit if std is None else 0.5 * std for std in self[3:5])
+        if all(map(surer, found[3:5], told_stds)):
+            better = found._replace(lead=self.lead, lead_std_ohm=self.lead_std_ohm)
+        if surer(found.lead_std_ohm, 0.5 * self.lead_or_usual(USUAL_LEAD_STD_OHM)[1]):
+            better = better._replace(lead=found.lead, lead_std_ohm=found.lead_std_ohm)
+        return better
 
     @property
     def both(self) -> tuple[float, float] | None:

@@ -216,11 +216,16 @@ class SkinReader:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration with the latest tare and the wires learned since; `save` keeps them."""
-        if self._shared.calibration is None:
+        """The calibration with the latest tare, and the wires if scans have taught them better.
+
+        `save` keeps them.
+        """
+        calibration = self._shared.calibration
+        if calibration is None:
             return None
-        wires = (self._shared.last_estimator or self._estimator).wires()
-        calibration = replace(self._shared.calibration, nominal_wire_ohm=wires)
+        learned = (self._shared.last_estimator or self._estimator).wires()
+        wires = calibration.nominal_wire_ohm.or_surer(learned)
+        calibration = replace(calibration, nominal_wire_ohm=wires)
         rest = self.rest
         if isinstance(rest, Untouched):  # a tare of this session has no level yet; a file needs it
             rest = Rest.of(calibration.method, self._shared.knowledge(rest), rest.date)
