@@ -43,8 +43,8 @@ _skin_of: Final = attrgetter(
 class LiveSkin(Closing):
     """A skin that is read all the time. All methods may be called from any thread.
 
-    A board that is not there, or goes away, is opened again and again. The latest tare and the
-    wires that were learned stay.
+    A board that is not there, or goes away, is opened again and again. The latest tare stays, and
+    so do the wires that were learned. (After a tare, a method learns them anew.)
 
     port, calibration, force: as `ohmskin.open` takes them.
     every: whether every scan is estimated. False: only the newest, whenever the estimate before it

@@ -166,6 +166,24 @@ def test_a_tare_leaves_the_wires_as_they_were_told(told: WireOhm) -> None:
     assert told_wires(reader) == told
 
 
+def test_wires_that_were_taught_outlive_a_tare_and_another_loop() -> None:
+    """Whichever estimator read last was asked, though it had seen one scan of an untouched skin."""
+    reader, scans = taught()
+    for scan in scans:
+        reader.read(scan)
+    learned = told_wires(reader)
+    assert learned.both is not None
+    (at_rest,) = islice(stepped("emulator://8x8?scene=rest"), 1)
+    reader.another().read(at_rest)
+    assert told_wires(reader) == learned
+    reader.tare(at_rest.ratio, force=True)
+    reader.read(at_rest)
+    assert told_wires(reader) == learned
+    reader.use("matrix")
+    reader.read(at_rest)
+    assert told_wires(reader) == learned
+
+
 def told_wires(reader: SkinReader) -> WireOhm:
     """The wires that a session would keep."""
     assert reader.calibration is not None

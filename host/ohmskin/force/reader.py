@@ -110,15 +110,14 @@ class _SharedKnowledge:
     calibration: gives newtons; None: there is none.
     rests: the rest of the calibration, or None where there is no calibration; after it, one rest
         for each tare that was not undone. The last of them is the rest that holds now.
-    last_estimator: the estimator of the reader that has read last. It is taken for the one that
-        has seen the most touches, and so knows most of the wires.
+    taught: of the estimators that have read scans, the one that knows the wires best.
     """
 
     def __init__(self, board: Hello, calibration: Calibration | None, ref_log_std: float) -> None:
         self.board, self._ref_log_std = board, ref_log_std
         self.calibration = calibration
         self.rests: list[Rest | Untouched | None] = [None]
-        self.last_estimator: Estimator | None = None
+        self.taught: Estimator | None = None
         self._recorded: list[Float] = []  # readings of the recorded tares that were taken
         self._lock = threading.Lock()  # two readers may come to the same one in two threads
         if calibration is not None:
@@ -135,6 +134,13 @@ class _SharedKnowledge:
             if not any(ratio is recorded for recorded in self._recorded):
                 self._recorded.append(ratio)
                 self.rests.append(Untouched(ratio, now()))
+
+    def hear(self, estimator: Estimator) -> None:
+        """Look whether this estimator, which has read a scan, now knows the wires best."""
+        if estimator is not self.taught and (
+            self.taught is None or _layer_std(estimator) <= _layer_std(self.taught)
+        ):
+            self.taught = estimator
 
     def estimator(self, method: str, rest: Rest | Untouched | None) -> Estimator:
         """A new estimator that knows this rest, and the wires that the calibration knows."""
@@ -223,7 +229,7 @@ class SkinReader:
         calibration = self._shared.calibration
         if calibration is None:
             return None
-        learned = (self._shared.last_estimator or self._estimator).wires()
+        learned = (self._shared.taught or self._estimator).wires()
         wires = calibration.nominal_wire_ohm.or_surer(learned)
         calibration = replace(calibration, nominal_wire_ohm=wires)
         rest = self.rest
@@ -314,7 +320,7 @@ class SkinReader:
         if self._made_for != (self._wanted, self.rest):  # rests are compared by identity
             self._make()
         estimate = self._estimator.estimate(scan.ratio, scan.reading_names)
-        self._shared.last_estimator = self._estimator
+        self._shared.hear(self._estimator)
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
         at_rest = np.median(estimate.level) if self._rest_level is None else self._rest_level
         rise = np.asarray(estimate.level - at_rest)
@@ -455,6 +461,11 @@ class CalibratedSkin(Closing):
         if self._focus is not None:
             self._focus.close()
         self.device.close()
+
+
+def _layer_std(estimator: Estimator) -> float:
+    """How well it knows the layer that it knows less: a deviation of a log."""
+    return max(np.inf if std is None else std for std in estimator.wires()[3:5])
 
 
 def now() -> str:
