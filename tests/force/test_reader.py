@@ -4,6 +4,7 @@
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -188,6 +189,25 @@ def told_wires(reader: SkinReader) -> WireOhm:
     """The wires that a session would keep."""
     assert reader.calibration is not None
     return reader.calibration.nominal_wire_ohm
+
+
+def test_threads_that_ask_for_the_latest_scan_follow_a_contact_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Scans were read in a wrong order: a touch that stayed became a new one every few scans."""
+    read, times_us = SkinReader.read, list[int]()
+
+    def slow(reader: SkinReader, scan: Scan) -> ForceScan:
+        times_us.append(scan.time_us)
+        time.sleep(0.01)
+        return read(reader, scan)
+
+    with ohmskin.open(f"{GHOST}&speed=0", calibration=of_scene("ghost")) as board:
+        monkeypatch.setattr(SkinReader, "read", slow)
+        with ThreadPoolExecutor(3) as pool:
+            scans = list(pool.map(lambda _: board.latest(), range(20)))
+    assert times_us == sorted(times_us)
+    assert {contact.identity for scan in scans for contact in scan.contacts} == {1, 2, 3}
 
 
 def test_tare_follows_a_drift(tmp_path: Path) -> None:

@@ -397,7 +397,7 @@ class CalibratedSkin(Closing):
         self._focus = Focus(device, FOLLOWING if focus is True else focus) if focus else None
         device.only_unit = device.info.unit_id
         self._reader.warm_up()
-        self._lock = threading.Lock()  # a reader takes one scan at a time
+        self._lock = threading.Lock()  # a reader takes one scan at a time, and in their order
 
     def new_reader(self) -> SkinReader:
         """A reader of this skin for another way of reading its scans; it knows the same tares."""
@@ -439,9 +439,8 @@ class CalibratedSkin(Closing):
 
     def latest(self, timeout_s: float | None = None) -> ForceScan:
         """The newest scan, with its forces."""
-        scan = self.device.latest(timeout_s)
         with self._lock:
-            return self._reader.read(scan)
+            return self._reader.read(self.device.latest(timeout_s))
 
     def tare(self, seconds: float = TARE_S, *, force: bool = False) -> Tare:
         """`SkinReader.tare_by`, which says what this raises."""
