@@ -267,6 +267,17 @@ def test_replay_gives_the_same_forces_bit_for_bit(tmp_path: Path, method: str) -
     assert live[30].force_n.tobytes() != untared[30].force_n.tobytes()
 
 
+def test_a_recorded_tare_that_cannot_be_read_is_never_in_force() -> None:
+    """The first scan was refused; the next ones were read by the rest before it."""
+    bench = stepped(GHOST)
+    reader = SkinReader(bench.info, of_scene("ghost"))
+    (scan,) = islice(bench, 1)
+    bad = replace(scan, rest_ratio=np.full((8, 8, 4), np.nan))
+    for _ in range(2):
+        with pytest.raises(ValueError, match="rest_ratio of cell"):
+            reader.read(bad)
+
+
 def test_a_tare_is_on_the_clock_of_the_scans() -> None:
     with ohmskin.open(f"{GHOST}&speed=0", calibration=of_scene("ghost")) as skin:
         skin.latest()

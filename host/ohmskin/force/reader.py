@@ -354,13 +354,13 @@ class SkinReader:
     def _make(self) -> None:
         """Make the estimator for the method and the rest that hold now."""
         method, rest = self._wanted, self.rest
-        self._made_for = method, rest
         self._estimator = self._shared.estimator(method, rest)
         self._rest_level: Float | None = None  # (R, C) [S; 1 for `voltage`]; None: unknown
-        if isinstance(rest, Rest) and self.has_forces:
+        if isinstance(rest, Rest) and method == self.force_method:
             self._rest_level = rest.level  # the level above which the curves were learned
         elif rest is not None:  # what this method makes of the rest, which may be below 0 by noise
             self._rest_level = np.maximum(self._estimator.rest_level(), 0.0)
+        self._made_for = method, rest  # last: a rest that cannot be read raises at each scan
 
 
 class CalibratedSkin(Closing):
