@@ -6,6 +6,7 @@ import re
 import signal
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ import pytest
 import ohmskin
 from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
+from ohmskin.calibrate.guide import Press
 from ohmskin.calibrate.tables import load_press_table
 from ohmskin.circuit.skin import current_from_ratio
+from ohmskin.cli.weights import guided
 from ohmskin.force.calibration import load_calibration
+from ohmskin.link.messages import Scan
 from ohmskin.record.readings import load_readings
 from scripted_skin import REST, ScriptedSkin, rise
 
@@ -157,6 +161,32 @@ def test_weights_are_asked_for_read_and_learned(weigh: Run, tmp_path: Path) -> N
     after = load_press_table(table)
     assert sorted(pairs_of(table)) == sorted(ASKED)
     assert after["conductance"][:3].tolist() == before["conductance"][3:].tolist()
+
+
+def test_readings_of_before_a_reset_are_not_kept_for_a_press() -> None:
+    """A clock that began anew let every scan since the rest count as one of the press."""
+    kept: list[Scan] = []
+    told_us = [*range(10**9, 10**9 + 2_000_000, 100_000), *range(0, 6_000_000, 100_000)]
+    given = iter(told_us)
+
+    def latest() -> Scan:
+        time_us = next(given)
+        is_pressed = 1_000_000 <= time_us < 4_000_000
+        return Scan(np.full((1, 2, 4), 500 * is_pressed, np.uint16), 0, time_us, 0.0, 0)
+
+    def estimate(ratio: Float) -> SimpleNamespace:
+        level = np.array([[0.0, 1e-4 * (ratio[0, 1, 0] > 0.1)]])
+        return SimpleNamespace(level=level, touched=level > 0)
+
+    guided(
+        SimpleNamespace(latest=latest, put=None),
+        SimpleNamespace(estimator=SimpleNamespace(estimate=estimate), rest_level=np.zeros((1, 2))),
+        SimpleNamespace(recorded=iter, add=lambda step, rest, window: kept.extend(window)),
+        [Press((0, 1), 1.0)],
+        1,
+    )
+    assert len(kept) > 5
+    assert all(scan.codes.all() for scan in kept)
 
 
 def test_a_full_table_is_fitted_at_once(weigh: Run, tmp_path: Path) -> None:

@@ -158,6 +158,8 @@ def guided(
             if skin.put is not None:  # a simulated skin: nobody else puts a weight on it
                 put = None if step.state is State.TAKE_OFF else step.wanted
                 skin.put(put if put is None or not anywhere else (places[done], put.force_n))
+            if window and scan.time_us <= window[-1].time_us:
+                window.clear()  # the board was reset: its clock begins anew
             window.append(scan)
             while 1e-6 * (scan.time_us - window[0].time_us) > READING_S:
                 window.popleft()
