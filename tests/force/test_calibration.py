@@ -200,6 +200,12 @@ def put(*place: Any) -> Callable[[dict[str, Any]], None]:
         (put("rest", "date", "today"), "rest: date is 'today', not ISO 8601"),
         (put("rest", "ratio", [0.5]), "rest.ratio has not the shape (2, 3, 4)"),
         (put("rest", "ratio", cells([2.0] * 4)), "rest: ratio at rest of cell (0, 0), reading A"),
+        (put("rest", "ratio", cells([None] * 4)), "rest: ratio at rest of cell (0, 0), reading A"),
+        (
+            put("rest", "ratio", [[[None] * 4] * 3, [[0.5] * 4] * 3]),
+            "rest: ratio at rest of cell (0, 0) is without any reading",
+        ),
+        (put("rest", "ratio", [[[None, 0.5, 0.5, 0.5], *[[0.5] * 4] * 2]] * 2), "rest: ratio at"),
         (put("rest", "level", None), "rest.level has not the shape (2, 3)"),
         (put("rest", "level", cells(-1e-6)), "rest: level at rest of cell (0, 0) is not finite"),
         (put("rest", "level", cells(None)), "rest.level holds NoneType, not float"),

@@ -278,6 +278,18 @@ def test_a_recorded_tare_that_cannot_be_read_is_never_in_force() -> None:
             reader.read(bad)
 
 
+@pytest.mark.parametrize("mode", ["half", "quick"])
+def test_a_tare_in_any_mode_of_near_ends_is_kept(mode: str, tmp_path: Path) -> None:
+    """'ohmskin tare' ended with "Out of range float values are not JSON compliant"."""
+    port, path = f"emulator://8x8?seed=1&speed=0&mode={mode}", tmp_path / "skin.json"
+    with ohmskin.open(port, calibration=of_scene("rest")) as board:
+        board.tare(0.1)
+        board.calibration.save(path)
+    for mode_now in (mode, "near"):
+        with ohmskin.open(f"{GHOST}&speed=0&mode={mode_now}", calibration=path) as board:
+            assert len(board.latest().contacts) == 3
+
+
 def test_a_tare_is_on_the_clock_of_the_scans() -> None:
     with ohmskin.open(f"{GHOST}&speed=0", calibration=of_scene("ghost")) as skin:
         skin.latest()

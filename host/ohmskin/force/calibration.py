@@ -21,7 +21,8 @@ lead_std_ohm                               standard deviation of the lead [ohm];
 indenter_area_m2                           what the skin was pressed with [m^2]; null: anything, by
                                            the total force on the skin, so there is no pressure
 rest.date                                  ISO 8601
-rest.ratio               R, C, 4           readings of the untouched skin before the presses [1]
+rest.ratio               R, C, 4           readings of the untouched skin before the presses [1];
+                                           null: not read, as in mode half
 rest.level               R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
 tare                                       the same of a later date, used in place of rest; null:
                                            there is none
@@ -82,8 +83,14 @@ _OWN: Final = {"unit_id": int, "date": str, "method": str, "mode": str}
 _ABOVE_0: Final = ("indenter_area_m2", "largest_force_n")
 _RESTS: Final = ("rest", "tare")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
-# Those of the model that may be null.
-_NULL_FIELDS: Final = ("residual_std", "residual_share", "held_out_rmse")
+# Those that may have null in place of numbers.
+_NULL_FIELDS: Final = (
+    "residual_std",
+    "residual_share",
+    "held_out_rmse",
+    "rest.ratio",
+    "tare.ratio",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +113,9 @@ class Rest:
         good = np.isfinite(self.level) & (self.level >= 0)
         require("level at rest", good, "not finite and >= 0")
         rows, columns = self.level.shape
-        check_ratio(self.ratio, rows, columns, "ratio at rest")
+        ratio = check_ratio(self.ratio, rows, columns, "ratio at rest")
+        is_read = np.asarray(np.isfinite(ratio).any(axis=-1))
+        require("ratio at rest", is_read, "without any reading")
 
     @classmethod
     def of(cls, method: str, knowledge: SkinKnowledge, date: str) -> Self:
@@ -233,17 +242,23 @@ class Calibration:
         content |= dict(zip(WIRE_FIELDS, self.nominal_wire_ohm, strict=True))
         for name in _RESTS:
             rest = getattr(self, name)
-            content[name] = None if rest is None else vars(rest)
+            content[name] = None if rest is None else vars(rest) | {"ratio": _null(rest.ratio)}
         if self.geometry is not None:
             of_kind = {"kind": self.geometry.kind, "frame_id": self.geometry.frame_id}
             content["geometry"] = of_kind | self.geometry.told
         for name in _MODEL_FIELDS:
             array = getattr(self.model, name)
-            null = np.isnan(array) if name in _NULL_FIELDS else np.False_
-            content[name] = np.where(null, None, array)
+            content[name] = _null(array) if name in _NULL_FIELDS else array
         text = json.dumps(content, allow_nan=False, default=np.ndarray.tolist)
         with whole_file(path) as file:
             file.write(text.encode())
+
+
+def _null(array: Float) -> NDArray[Any]:
+    """The array with None in place of NaN."""
+    nulled = array.astype(object)
+    nulled[np.isnan(array)] = None
+    return nulled
 
 
 def _check_date(date: str) -> None:

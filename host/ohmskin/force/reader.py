@@ -246,7 +246,8 @@ class SkinReader:
         """
         board, calibration = self.board, self.calibration
         if calibration is not None:
-            codes = quantise(calibration.untouched.ratio, board.adc_bits)
+            ratio = np.nan_to_num(calibration.untouched.ratio, nan=0.5)  # of mode half, say
+            codes = quantise(ratio, board.adc_bits)
             reader = SkinReader(board, calibration, force=True)
             reader.read(Scan(codes, 0, 0, 0.0, 0, mode=board.mode))
 
