@@ -71,7 +71,8 @@ class LiveSkin(Closing):
         self.failure: Exception | None = None
         """Why there are no scans now; None while they come, and before the port was first tried."""
         self.skipped = 0
-        """How many scans were passed over, because this machine is too slow for all of them."""
+        """How many scans were passed over, because this machine is too slow for all of them.
+        `Scan.missed` does not count them: it is of the line."""
         self.opened = 0
         """How often the port was opened."""
         self.ended = False
@@ -104,14 +105,17 @@ class LiveSkin(Closing):
         timeout_s: how long to wait [s] if there is no such scan yet.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._count > count or self.ended, timeout_s)
+            self._changed.wait_for(lambda: self._count > count or self._is_over, timeout_s)
             begin = max(len(self._kept) - max(self._count - count, 0), 0)
             return self._count, list(islice(self._kept, begin, None))
 
     def __iter__(self) -> Iterator[ForceScan]:
         """Every scan from now on, until `close`; also after the board was away."""
-        count = self._count
-        while not self.ended:
+        return self._after(self._count)
+
+    def _after(self, count: int) -> Iterator[ForceScan]:
+        scans: list[ForceScan] = []
+        while scans or not self._is_over:
             count, scans = self.since(count, SILENCE_TIMEOUT_S)
             yield from scans
 
@@ -134,6 +138,11 @@ class LiveSkin(Closing):
         """As `CalibratedSkin.tare`. Raises what that raises, and what `there` raises."""
         device, reader = self.there()
         return reader.tare_by(device, seconds, force=force)
+
+    @property
+    def _is_over(self) -> bool:
+        """Whether nobody needs to wait for more scans."""
+        return self.ended or self.closing.is_set()
 
     def _work(self) -> None:
         """The thread's work: read the port, and open it again whenever it goes away.
@@ -211,7 +220,7 @@ class LiveSkin(Closing):
     def close(self) -> None:
         """End reading. May be called again."""
         self.closing.set()
+        self._tell()  # at once: the thread may never end
         if (device := self._device) is not None:
             device.close()
         self._thread.join(_CLOSE_S)
-        self._tell()

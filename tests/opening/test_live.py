@@ -134,6 +134,49 @@ def test_a_defect_ends_who_waits(monkeypatch: pytest.MonkeyPatch) -> None:
         assert "defect of this program: ZeroDivisionError" in str(skin.failure)
 
 
+def test_an_iterator_gives_the_last_scans_of_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread was at the end while a program was busy with a scan: it dropped all after that."""
+    monkeypatch.setattr(live, "LATE_S", ENOUGH_S)
+    path = tmp_path / "a.mcap"
+    with ohmskin.open(URL) as board, Recorder(path, board.info) as recorder:
+        for scan in islice(board, 20):
+            recorder.add(scan)
+    go_on = threading.Event()
+    monkeypatch.setattr(SkinReader, "warm_up", lambda reader: go_on.wait(ENOUGH_S))
+    with LiveSkin(f"replay://{path}?speed=0", of_scene("ghost")) as skin:
+        scans = iter(skin)
+        go_on.set()
+        found = [next(scans)]
+        while not skin.ended:
+            time.sleep(0.01)
+        found += scans
+    assert len(found) == 20
+
+
+def test_close_ends_an_iterator_while_the_port_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "_CLOSE_S", 0.1)
+    hangs = threading.Event()
+
+    def never(*_: object, **__: object) -> None:
+        hangs.wait(ENOUGH_S)
+        raise DeviceLost("unplugged")
+
+    monkeypatch.setattr(live.opening, "open", never)
+    skin, found = LiveSkin("/dev/hangs", None), list[ohmskin.ForceScan]()
+    reader = threading.Thread(target=lambda: found.extend(skin))
+    reader.start()
+    skin.close()
+    reader.join(2.0)  # without an end, it would wait for 5 s
+    still_waits = reader.is_alive()
+    hangs.set()
+    reader.join()
+    skin.close()
+    assert not still_waits
+    assert not found
+
+
 def test_a_recording_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "LATE_S", -1.0)  # scans that wait are never too late
     path = tmp_path / "a.mcap"
