@@ -11,7 +11,7 @@ import pytest
 import ohmskin
 from calibrations import of_scene
 from ohmskin.arrays import Bool
-from ohmskin.errors import CommandRefused
+from ohmskin.errors import CommandRefused, DeviceLost
 from ohmskin.force.focus import WHOLE_HZ, Focus, Lines, wanted_lines
 from ohmskin.link.device import Region, scans_for
 from ohmskin.link.messages import Hello
@@ -104,6 +104,14 @@ def test_who_has_followed_contacts_leaves_the_board_as_it_was() -> None:
         assert (skin.info.mode, skin.info.row_mask) == ("near", 0b11100)
     focus.follow(touched((5, 4)), 1, next(iter(skin)))
     assert skin.info == replace(before, scanning=1)
+
+
+def test_the_port_is_given_back_whatever_the_skin_has_become() -> None:
+    """The region of before was beyond a skin of fewer rows: the port stayed open."""
+    with ohmskin.open("emulator://8x8", calibration=of_scene("rest"), focus=True) as skin:
+        skin.device.configure(rows=4)
+    with pytest.raises(DeviceLost, match="was closed"):
+        skin.latest()
 
 
 def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:

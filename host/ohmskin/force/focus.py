@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ohmskin.arrays import Bool
-from ohmskin.errors import CommandRefused, DeviceLost
+from ohmskin.errors import OhmskinError
 from ohmskin.files import Closing
 from ohmskin.link.device import Device, Region
 from ohmskin.link.messages import Scan
@@ -98,7 +98,7 @@ class Focus(Closing):
 
     def close(self) -> None:
         """Let the board scan as it did before this focus. May be called again."""
-        with self._lock, suppress(DeviceLost, CommandRefused):
+        with self._lock, suppress(OhmskinError, ValueError):  # it may be another skin by now
             if not self._closed:
                 self._closed = True
                 self._device.set_region(self._before)

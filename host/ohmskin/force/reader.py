@@ -458,9 +458,11 @@ class CalibratedSkin(Closing):
 
     def close(self) -> None:
         """Close the device. May be called again."""
-        if self._focus is not None:
-            self._focus.close()
-        self.device.close()
+        try:
+            if self._focus is not None:
+                self._focus.close()
+        finally:
+            self.device.close()
 
 
 def _layer_std(estimator: Estimator) -> float:
