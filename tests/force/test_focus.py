@@ -2,6 +2,7 @@
 """Where reading goes after each scan."""
 
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -104,6 +105,16 @@ def test_who_has_followed_contacts_leaves_the_board_as_it_was() -> None:
         assert (skin.info.mode, skin.info.row_mask) == ("near", 0b11100)
     focus.follow(touched((5, 4)), 1, next(iter(skin)))
     assert skin.info == replace(before, scanning=1)
+
+
+def test_after_a_loop_the_whole_skin_is_read() -> None:
+    """The region stayed: where nobody moved it, later touches were not seen."""
+    url = "emulator://8x8?scene=single&seed=1&begin=0&speed=0"
+    with ohmskin.open(url, calibration=of_scene("single"), focus=True) as skin:
+        assert not all(scan.is_whole for scan in islice(skin, 20))
+        assert skin.info.row_mask == 0xFF
+        skin.latest()
+        assert all(skin.latest().is_whole for _ in range(20))
 
 
 def test_the_port_is_given_back_whatever_the_skin_has_become() -> None:

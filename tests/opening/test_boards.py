@@ -226,6 +226,22 @@ def test_each_board_has_the_calibration_of_its_unit(tmp_path: Path) -> None:
     assert largest[2] == pytest.approx(2 * largest[1], rel=0.1)
 
 
+def test_boards_with_calibrations_begin_together() -> None:
+    """Each began when the merge first took a scan of it: those of the first one waited."""
+    told = [of_scene("rest", unit_id=unit) for unit in (1, 2)]
+    with ohmskin.open_all(units(1, 2), calibrations=told, start=False) as skins:
+        scans = skins.scans()
+        until_s = time.monotonic() + 10
+        while not all(skin.stats.scans for skin in skins.values()):
+            assert time.monotonic() < until_s, "a board does not scan"
+            time.sleep(0.01)
+        first = dict[int, int]()
+        while len(first) < 2:
+            each = next(scans)
+            first.setdefault(each.unit_id, each.scan.number)
+    assert first == {1: 0, 2: 0}
+
+
 @pytest.mark.parametrize(
     ("urls", "calibrated", "words"),
     [

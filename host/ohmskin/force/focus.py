@@ -96,6 +96,13 @@ class Focus(Closing):
                 self._lines = lines
                 self._ask(lines)
 
+    def rest(self) -> None:
+        """Let the board read the whole skin, until `follow` is called again."""
+        with self._lock, suppress(OhmskinError, ValueError):
+            if self._lines is not None and not self._closed:
+                self._lines = None
+                self._ask(None)
+
     def close(self) -> None:
         """Let the board scan as it did before this focus. May be called again."""
         with self._lock, suppress(OhmskinError, ValueError):  # it may be another skin by now

@@ -432,7 +432,14 @@ class CalibratedSkin(Closing):
         """Every scan from now on, with its forces."""
         reader = self.new_reader()
         reader.focus = self._focus
-        yield from map(reader.read, self.device)
+        return self._read_by(reader, iter(self.device))
+
+    def _read_by(self, reader: SkinReader, scans: Iterator[Scan]) -> Iterator[ForceScan]:
+        try:
+            yield from map(reader.read, scans)
+        finally:
+            if self._focus is not None:
+                self._focus.rest()
 
     def __aiter__(self) -> AsyncIterator[ForceScan]:
         """The same for ``async for``."""
