@@ -107,6 +107,15 @@ def test_who_has_followed_contacts_leaves_the_board_as_it_was() -> None:
     assert skin.info == replace(before, scanning=1)
 
 
+def test_focus_is_refused_for_a_method_that_takes_no_regions() -> None:
+    """It was opened, and ended in the middle, when the first touch came."""
+    of_skin = of_scene("rest", method="voltage", siemens=0.1)
+    with pytest.raises(
+        ValueError, match="'voltage' takes whole scans, and focus reads parts: leav"
+    ):
+        ohmskin.open("emulator://8x8", calibration=of_skin, focus=True)
+
+
 def test_after_a_loop_the_whole_skin_is_read() -> None:
     """The region stayed: where nobody moved it, later touches were not seen."""
     url = "emulator://8x8?scene=single&seed=1&begin=0&speed=0"

@@ -28,7 +28,6 @@ from ohmskin.estimate.knowledge import REF_LOG_STD
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.contacts import ContactTracker
-from ohmskin.force.focus import Focus
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -85,7 +84,7 @@ def stream(
                 # Without a calibration the rest is unknown, and cells may seem touched.
                 reader.tare(skin.mean_ratio(tare_s), force=loaded is None)
             if focus:
-                reader.focus = stack.enter_context(Focus(skin))
+                reader.focus = stack.enter_context(reader.focus_on(skin))
         with ends_by_ctrl_c(), ends_in_time(_out.show_cursor):
             given = asked_for(skin, scans, seconds)
             if as_json:

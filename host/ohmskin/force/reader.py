@@ -25,7 +25,7 @@ from ohmskin.circuit.skin import is_near
 from ohmskin.errors import TareRefused
 from ohmskin.estimate.base import Estimate, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, REF_LOG_STD, SkinKnowledge
-from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.methods import kind_of, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker
@@ -300,6 +300,16 @@ class SkinReader:
 
         return Tare.of(rest_ratio, self.board, time.monotonic())
 
+    def focus_on(self, device: Device, like: Region = FOLLOWING) -> Focus:
+        """A `Focus` for this reader: set the attribute `focus` to it, and contacts are followed.
+
+        Raises what `Focus` raises, and ValueError if the method takes no regions.
+        """
+        if not kind_of(self._wanted).takes_partial:
+            remedy = "leave focus out, or use 'joint' or 'touch'"
+            raise ValueError(f"'{self._wanted}' takes whole scans, and focus reads parts: {remedy}")
+        return Focus(device, like)
+
     def check_mode(self, mode: str) -> None:
         """Raise ValueError if the board now scans in a mode that the estimator cannot read.
 
@@ -378,7 +388,7 @@ class CalibratedSkin(Closing):
     does.
 
     :raises ValueError: the calibration is of another unit, size or mode; with `focus`: the board
-        reads far ends.
+        reads far ends, or the method takes no regions.
     :raises CommandRefused: with `focus`: the board has no regions, or is a recording.
     :raises DeviceLost: with `focus`: the board does not answer.
     """
@@ -395,7 +405,9 @@ class CalibratedSkin(Closing):
         self.name = device.name
         """See `Device.name`."""
         self._reader = SkinReader(device.info, calibration, force=force)
-        self._focus = Focus(device, FOLLOWING if focus is True else focus) if focus else None
+        self._focus: Focus | None = None
+        if focus:
+            self._focus = self._reader.focus_on(device, FOLLOWING if focus is True else focus)
         device.only_unit = device.info.unit_id
         self._reader.warm_up()
         self._lock = threading.Lock()  # a reader takes one scan at a time, and in their order

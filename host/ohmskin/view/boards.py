@@ -28,7 +28,6 @@ from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, kind_of, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
-from ohmskin.force.focus import Focus
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
@@ -226,7 +225,7 @@ class ViewedBoard(LiveSkin):
             device, reader = self.there()
             self._end_focus()
             if on:
-                reader.focus = Focus(device)
+                reader.focus = reader.focus_on(device)
         return "contacts are read often" if on else "the whole skin is read in every scan"
 
     def _end_focus(self) -> None:
