@@ -52,7 +52,7 @@ class CommandRefused(OhmskinError):
 
 
 class TareRefused(OhmskinError):
-    """Something seems to touch the skin, or there is no tare to undo; nothing has changed."""
+    """Something touches the skin, it is not connected, or no tare is to undo; nothing changed."""
 
 
 class RecordingError(OhmskinError):

@@ -136,6 +136,22 @@ def taught(scans: int = 30) -> tuple[SkinReader, list[Scan]]:
     return reader, [replace(scan, codes=quantise(ratio, 10)) for ratio in trial.ratio]
 
 
+@pytest.mark.parametrize("method", ["joint", "voltage"])
+def test_a_skin_that_is_not_connected_is_no_rest(method: str) -> None:
+    """The tare was taken, and after that, all 64 cells of the skin were touched."""
+    bench = stepped("emulator://8x8?seed=1")
+    reader = SkinReader(bench.info, of_scene("rest", method=method, siemens=0.1))
+    (scan,) = islice(bench, 1)
+    unplugged = np.where(scan.ratio > 0.5, 1023.5 / 1024, 0.5 / 1024)
+    with pytest.raises(TareRefused, match=r"most cells conduct less than 10% .*: connect the skin"):
+        reader.tare(unplugged)
+    assert not reader.is_tared
+    reader.tare(unplugged, force=True)
+    assert reader.is_tared
+    reader.undo_tare()
+    reader.tare(scan.ratio)
+
+
 def test_wires_that_a_session_has_taught_are_kept(tmp_path: Path) -> None:
     reader, scans = taught()
     assert told_wires(reader) == NO_WIRES

@@ -44,6 +44,9 @@ DEFAULT_METHOD: Final = "joint"
 # A tare is the mean of the scans of so many seconds [s], unless told. Chosen: the mean of 90 scans
 # has a tenth of the noise of one scan, and nobody has to wait for long.
 TARE_S: Final = 1.0
+# A cell that conducts less than this share of what it did at rest counts as open. Chosen: rests
+# drift by a third, and an open line leaves a thousandth.
+_OPEN_SHARE: Final = 0.1
 # An error names so many touched cells, and counts the others. Chosen: so many fit into a line.
 _NAMED_CELLS: Final = 4
 
@@ -259,23 +262,30 @@ class SkinReader:
     def tare(self, rest_ratio: Float, *, force: bool = False) -> Tare:
         """Take these readings (R, C, 4) for the rest. Returns what a `Recorder` keeps.
 
-        force: take them even if cells seem touched, as where the rest has drifted.
+        force: take them even if cells seem touched or open, as where the rest has drifted.
 
-        :raises TareRefused: something touches the skin.
+        :raises TareRefused: something touches the skin, or it is not connected.
         """
         # A new estimator judges the readings. The one that reads the scans would begin from the
         # frame before, which may show a touch.
-        touched = self._shared.estimator(self._wanted, self.rest).estimate(rest_ratio).touched
-        if touched.any() and not force:
+        estimator = self._shared.estimator(self._wanted, self.rest)
+        found = estimator.estimate(rest_ratio)
+        if found.touched.any() and not force:
             remedy = "take everything off the skin, or force the tare if nothing is on it"
-            raise TareRefused(touched_cells(touched), remedy)
+            raise TareRefused(touched_cells(found.touched), remedy)
+        if self.rest is not None and not force:
+            # By deviations less: a rest may be too small to be measured.
+            open_level = _OPEN_SHARE * estimator.rest_level() - 2 * found.level_std
+            if np.mean(found.level < open_level) > 0.5:
+                text = f"most cells conduct less than {_OPEN_SHARE:.0%} of what they did at rest"
+                raise TareRefused(text, "connect the skin, or force the tare if it is connected")
         self._shared.rests.append(Untouched(rest_ratio, now()))
         return self._to_record(rest_ratio)
 
     def tare_by(self, device: Device, seconds: float = TARE_S, *, force: bool = False) -> Tare:
         """`tare` with the mean of the scans of the device in the coming seconds.
 
-        :raises TareRefused: something touches the skin.
+        :raises TareRefused: as `tare`.
         :raises DeviceLost: as `Device.mean_ratio`.
         :raises ValueError: the board scans in another mode than was calibrated.
         """
