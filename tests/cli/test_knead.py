@@ -13,12 +13,14 @@ from test_first_hour import streamed
 import ohmskin
 from command_line import Command, Run, assert_one_line, well
 from ohmskin.calibrate.coverage import LiveCoverage
+from ohmskin.calibrate.sessions import joined
 from ohmskin.cli.knead import KneadMap
 from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import load_calibration
 from ohmskin.record.recorder import Recorder
-from ohmskin.record.recording import Tare, load_recording
+from ohmskin.record.recording import Recording, Tare, load_recording
+from stepped import stepped
 
 SKIN = "emulator://2x3?speed=0&rate=20"
 TRUTH = ("--force-port", "truth")
@@ -102,6 +104,31 @@ def test_wrong_uses_of_knead(run: Run, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
     done = run(*knead, "truth", "--seconds", "3")
     assert_one_line(done._replace(out=""), "force_n is 0 throughout: does the sensor")
+
+
+def test_a_board_that_cannot_be_kneaded_says_so_at_once(run: Run, tmp_path: Path) -> None:
+    """It was kneaded until all was known, and then refused."""
+    knead, out = ("calibrate", "knead"), str(tmp_path / "skin.json")
+    done = run(*knead, f"{SKIN}&scene=knead&mode=half", out, *TRUTH)
+    assert_one_line(
+        done, "all of it, and this board is in mode half: 'ohmskin configure PORT --mode near'"
+    )
+    well(run(*knead, f"{SKIN}&scene=knead", out, *TRUTH, "--seconds", "11"))
+    done = run(*knead, f"{SKIN}&scene=knead&mode=far", out, *TRUTH)
+    of = "2x3 cells of unit 0 in mode"
+    assert_one_line(done, f"recorded before: {of} near; now: {of} far: move the recordings")
+    assert not (tmp_path / "skin.knead-2.mcap").exists()
+
+
+def test_a_recording_that_has_no_scans_spoils_no_other() -> None:
+    """An interrupted start took the tare of all that had been recorded before."""
+    bench = stepped("emulator://2x3")
+    scans = list(islice(bench, 3))
+    tare = Tare(scans[0].ratio, scans[0].host_time_s)
+    good = Recording([bench.info], scans, [tare], [], [], cut_off=False)
+    whole = joined([good, Recording([bench.info], [], [], [], [], cut_off=False)])
+    assert len(whole.scans) == 3
+    assert whole.tares == [tare]
 
 
 def test_the_map_shows_each_cell_and_where_to_press_next(

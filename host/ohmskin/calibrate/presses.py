@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.regression import ForceRegression
-from ohmskin.calibrate.rules import check_cell, check_cells_differ
+from ohmskin.calibrate.rules import check_cell, check_cells_differ, check_complete
 from ohmskin.calibrate.tables import ForceLog, PressTable
 from ohmskin.calibrate.wires import FoundWires, PressReadings, find_wires
 from ohmskin.errors import TareRefused
@@ -248,8 +248,7 @@ class Calibrator:
     force: bool = False
 
     def __post_init__(self) -> None:
-        if not self.board.is_complete:
-            raise ValueError("a skin is calibrated in mode near or far, all of it")
+        check_complete(self.board)
         self.found: FoundWires | None = None
         self._tell(self.nominal_wire_ohm)
         at_rest = make_estimator(DEFAULT_METHOD, self.knowledge).rest()

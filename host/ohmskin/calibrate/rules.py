@@ -4,6 +4,7 @@
 =============================================================== ==================================
 rule                                                            checked by
 =============================================================== ==================================
+scans are complete                                              `check_complete`
 a cell is on the skin                                           `check_cell`
 a force pushes: 0 N or more                                     `require_forces`
 no number is beyond `MAX_NUMBER`                                each reader of files
@@ -21,10 +22,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
+from ohmskin.link.messages import Hello
 
 # A cell with fewer presses has no curve of its own. A curve has 2 coefficients, and 4 presses would
 # leave 2 degrees of freedom, for which Student's t has no finite variance.
 MIN_PRESSES: Final = 5
+
+
+def check_complete(board: Hello) -> None:
+    """Raise ValueError if scans of this board do not have all readings of all cells."""
+    if not board.is_complete:
+        raise ValueError(
+            "a skin is calibrated in mode near or far, all of it, and this board is in mode "
+            f"{board.mode}: 'ohmskin configure PORT --mode near'"
+        )
 
 
 def check_cell(row: int, column: int, shape: tuple[int, int]) -> tuple[int, int]:

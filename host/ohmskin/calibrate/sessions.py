@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from ohmskin.link.messages import Hello
 from ohmskin.record.recording import ForceSample, Recording
 
 # So much time is taken to pass between two recordings [s]. Chosen: longer than any gap across which
@@ -26,22 +27,35 @@ def session_paths(out: Path, what: str) -> tuple[list[Path], Path]:
     return paths, path
 
 
+def check_same(recordings: list[Recording], board: Hello) -> None:
+    """Raise ValueError if one of them is not of this board's skin, or not in its mode."""
+    now = _kind(board)
+    for given in recordings:
+        if (before := _kind(given.hellos[-1])) != now:
+            raise ValueError(
+                f"recorded before: {before}; now: {now}: move the recordings of before away, or "
+                "use the board as it was"
+            )
+
+
+def _kind(board: Hello) -> str:
+    return f"{board.rows}x{board.columns} cells of unit {board.unit_id} in mode {board.mode}"
+
+
 def joined(recordings: list[Recording]) -> Recording:
-    """One recording of all, on one clock. The rest is the newest one's.
+    """One recording of all, on one clock. The rest is that of the newest one with a tare.
 
     What the force sensor shows while nothing touches the skin, up to the tare, is taken off the
     forces of each. Raises ValueError if they are not of one skin in one mode.
     """
-    last = recordings[-1]
+    check_same(recordings, recordings[-1].hellos[-1])
+    last = next(
+        (each for each in reversed(recordings) if each.scans and each.tares), recordings[-1]
+    )
     board = last.hellos[-1]
     whole = Recording([board], [], last.tares[:1], [], [], last.cut_off)
     end_s, end_us = 0.0, 0
     for given in recordings:
-        of = given.hellos[-1]
-        if (of.rows, of.columns, of.mode, of.unit_id) != (
-            *(board.rows, board.columns, board.mode, board.unit_id),
-        ):
-            raise ValueError("recordings of several skins: move those of the other one away")
         if not (given.scans and given.tares):
             continue
         later_s = end_s + PAUSE_S - given.scans[0].host_time_s

@@ -21,7 +21,7 @@ from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.rules import check_cells_differ, check_enough
 from ohmskin.calibrate.scale import printed_s
-from ohmskin.calibrate.sessions import joined, session_paths
+from ohmskin.calibrate.sessions import check_same, joined, session_paths
 from ohmskin.calibrate.tables import ForceLog, load_force_log, load_press_table
 from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
 from ohmskin.cli.knead import kneaded
@@ -168,6 +168,7 @@ def _weigh_anywhere(port: str, out: Path, forces_n: Float, calibrator_of: _Calib
     if missing:
         with ohmskin.open(port) as skin:
             skin.only_unit = skin.info.unit_id
+            check_same(recordings, skin.info)
             rest_ratio = _rest_of(skin)
             calibrator = calibrator_of(skin.info, rest_ratio)
             with Recorder(path, skin.info, lambda: skin.now_s) as recorder:

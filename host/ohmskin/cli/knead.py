@@ -14,7 +14,8 @@ from rich.text import Text
 
 import ohmskin
 from ohmskin.calibrate.coverage import KNOWN_LOG, LEAST_N, LiveCoverage
-from ohmskin.calibrate.sessions import joined, session_paths
+from ohmskin.calibrate.rules import check_complete
+from ohmskin.calibrate.sessions import check_same, joined, session_paths
 from ohmskin.cli.board import TERMINAL, asked_for
 from ohmskin.cli.record import FORCE_TARE_S, with_truth
 from ohmskin.cli.stream import cell_table
@@ -86,6 +87,8 @@ def kneaded(
     recordings = [load_recording(each) for each in before]
     with ohmskin.open(port, start=False) as skin:
         skin.only_unit = skin.info.unit_id
+        check_complete(skin.info)
+        check_same(recordings, skin.info)
         coverage = LiveCoverage(skin.info)
         for given in recordings:
             coverage.look_at(given)
