@@ -52,6 +52,7 @@ def test_cells_that_share_wires_may_err_alike() -> None:
         (0.5, 0.5, "0.50 +- 0.50 N"),
         (0.5, 0.51, "uncertain"),
         (0.0, 0.0, "0.00 +- 0.00 N"),
+        (1.234, float("nan"), "1.23 N"),
     ],
 )
 def test_a_force_is_written_with_its_deviation(force_n: float, std_n: float, text: str) -> None:

@@ -49,7 +49,12 @@ class Contact:
 
     @property
     def force_text(self) -> str:
-        """Its newtons for people: "1.23 +- 0.10 N"; "uncertain" where the deviation is larger."""
+        """Its newtons for people: "1.23 +- 0.10 N"; "uncertain" where the deviation is larger.
+
+        "1.23 N" where the deviation is not known.
+        """
+        if np.isnan(self.force_n_std):
+            return f"{self.force_n:.2f} N"
         if self.force_n_std > self.force_n:
             return "uncertain"
         return f"{self.force_n:.2f} +- {self.force_n_std:.2f} N"
