@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whatever is saved: the file is whole, or the old one."""
 
+import errno
 import os
 import time
 from collections.abc import Callable
@@ -13,6 +14,23 @@ from calibrations import of_scene
 from ohmskin import files
 from ohmskin.calibrate.tables import PRESS, save_press_table
 from ohmskin.record.readings import save_arrays
+
+
+def test_where_holes_are_not_known_all_of_a_file_is_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It counted as empty on such a file system, and a recording there as a bomb."""
+    seek = os.lseek
+
+    def knows_no_holes(file: int, at: int, how: int) -> int:
+        if how != os.SEEK_SET:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        return seek(file, at, how)
+
+    (tmp_path / "file").write_bytes(b"data")
+    monkeypatch.setattr(os, "lseek", knows_no_holes)
+    with (tmp_path / "file").open("rb") as file:
+        assert files.stored_bytes(file) == 4
 
 
 def save_bytes(path: Path) -> None:

@@ -2,6 +2,7 @@
 """Files that are read within bounds and written whole or not at all; what a ``with`` closes."""
 
 import csv
+import errno
 import os
 import shutil
 import stat
@@ -56,11 +57,14 @@ def stored_bytes(file: BinaryIO) -> int:
     The file is left at its beginning.
     """
     stored, at, end = 0, 0, os.fstat(file.fileno()).st_size
-    with suppress(OSError):  # there is nothing but a hole from there on
+    try:
         while hasattr(os, "SEEK_DATA") and at < end:
             begin = os.lseek(file.fileno(), at, os.SEEK_DATA)
             at = os.lseek(file.fileno(), begin, os.SEEK_HOLE)
             stored += at - begin
+    except OSError as error:
+        if error.errno != errno.ENXIO:  # else there is nothing but a hole from there on
+            stored = end
     os.lseek(file.fileno(), 0, os.SEEK_SET)
     return stored if hasattr(os, "SEEK_DATA") else end
 
