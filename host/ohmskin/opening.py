@@ -75,9 +75,11 @@ def open(
     :raises ProtocolError: the board says what cannot be.
     :raises RecordingError: the recording of a ``replay://`` port cannot be read.
     :raises ValueError: the calibration cannot be read, or is of another unit, size or mode; with
-        `focus`: the board reads far ends.
+        `focus`: there is no calibration, its method takes no regions, or the board reads far ends.
     :raises CommandRefused: with `focus`: the board has no regions, or is a recording.
     """
+    if focus and calibration is None:
+        raise ValueError("focus follows contacts, which scans have with a calibration: give one")
     # The file first: a board may take seconds to boot, and a wrong file is known at once.
     of_skin = None if calibration is None else loaded(calibration)
     with ExitStack() as opened:

@@ -116,6 +116,12 @@ def test_focus_is_refused_for_a_method_that_takes_no_regions() -> None:
         ohmskin.open("emulator://8x8", calibration=of_skin, focus=True)
 
 
+def test_focus_needs_a_calibration() -> None:
+    """Without one, the whole skin was read at its usual rate, and nothing said why."""
+    with pytest.raises(ValueError, match="scans have with a calibration: give one"):
+        ohmskin.open("emulator://8x8", focus=True)
+
+
 def test_after_a_loop_the_whole_skin_is_read() -> None:
     """The region stayed: where nobody moved it, later touches were not seen."""
     url = "emulator://8x8?scene=single&seed=1&begin=0&speed=0"
