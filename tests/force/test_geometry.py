@@ -13,6 +13,8 @@ import ohmskin
 from calibrations import of_scene
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.geometry import Geometry
+from ohmskin.force.reader import SkinReader
+from stepped import stepped
 
 FLAT = {"kind": "flat", "frame_id": "skin", "pitch_m": [0.01, 0.02]}
 CYLINDER = {"kind": "cylinder", "frame_id": "arm", "pitch_m": [0.01, 0.02], "radius_m": 0.04}
@@ -94,6 +96,16 @@ def test_contacts_and_scans_have_places_and_sums(tmp_path: Path) -> None:
     assert force_n == pytest.approx(sum(-f * n for f, _, n in pushes))
     assert torque_nm == pytest.approx(sum(np.cross(p, -f * n) for f, p, n in pushes))
     assert force_n[2] < -1
+
+
+def test_without_forces_a_wrench_says_so(tmp_path: Path) -> None:
+    """It said that nobody had told where the cells are, though the calibration has it."""
+    placed = replace(of_scene("rest"), geometry=geometry(tmp_path / "skin.json", FLAT))
+    bench = stepped("emulator://8x8")
+    reader = SkinReader(bench.info, placed, method="matrix")
+    scan = reader.read(next(iter(bench)))
+    with pytest.raises(ValueError, match="no forces: read scans with a calibration, and by its"):
+        _ = scan.wrench
 
 
 def test_without_geometry_a_wrench_says_what_to_do() -> None:

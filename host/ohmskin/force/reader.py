@@ -76,9 +76,11 @@ class ForceScan(Scan):
     def wrench(self) -> tuple[Float, Float]:
         """Net force (3,) [N] and torque (3,) [N m] on the skin: `Geometry.wrench`.
 
-        :raises ValueError: there is no geometry.
+        :raises ValueError: there are no forces, or no geometry.
         """
         if self.geometry is None:
+            if np.isnan(self.force_n).all():
+                raise ValueError("no forces: read scans with a calibration, and by its own method")
             raise ValueError(
                 "nobody has said where the cells are: 'ohmskin skin FILE --pitch-mm 10,10'"
             )
