@@ -126,6 +126,25 @@ def test_icub_s_files_are_read(tmp_path: Path) -> None:
         Geometry.of_file(path, 2, 3, "palm")
 
 
+@pytest.mark.parametrize(
+    ("arrays", "reason"),
+    [
+        ('<array rows="12" cols="12" size="1 1"/>', "an <array> of 12x12 taxels, the skin has 2x3"),
+        ('<array rows="2" cols="3" size="1 1" order="col-major"/>', "row-major and"),
+        ('<array rows="2" cols="3" size="1 1" offset="0.1 0"/>', "without an offset"),
+        ('<array size="1 1"/><array size="2 2"/>', "not one <array>, row-major"),
+    ],
+)
+def test_an_array_that_is_not_this_skin_s_is_refused(
+    tmp_path: Path, arrays: str, reason: str
+) -> None:
+    """Cells were put where the file had none."""
+    path = tmp_path / "robot.urdf"
+    path.write_text(f"<robot>{arrays}</robot>")
+    with pytest.raises(ValueError, match=reason):
+        Geometry.of_file(path, 2, 3, "skin")
+
+
 def test_urdf_is_read(tmp_path: Path) -> None:
     path = tmp_path / "robot.urdf"
     taxels = (

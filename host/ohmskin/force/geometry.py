@@ -131,7 +131,7 @@ class Geometry:
         """
         with naming(path):
             text = read_bounded(path, _MAX_FILE_BYTES).decode(errors="replace")
-            told = (_of_urdf if "<" in text else _of_lines)(text)
+            told = _of_urdf(text, rows, columns) if "<" in text else _of_lines(text)
             if "pitch_m" in told:
                 return cls("flat", frame_id, rows, columns, told)
             count = len(told["normal"])
@@ -150,7 +150,7 @@ def _of_lines(text: str) -> dict[str, Float]:
     return _table(np.array(lines, dtype=np.float64).reshape(-1, 6))
 
 
-def _of_urdf(text: str) -> dict[str, Float]:
+def _of_urdf(text: str, rows: int, columns: int) -> dict[str, Float]:
     if "<!" in text.replace("<!--", ""):
         raise ValueError("its XML declares types or entities, which no URDF needs")
     try:
@@ -164,7 +164,16 @@ def _of_urdf(text: str) -> dict[str, Float]:
             raise ValueError(f"{name}='{taxel.get(name, '')[:40]}' is not {count} numbers")
         return found
 
-    if (grid := tree.find(".//array")) is not None:
+    if grids := tree.findall(".//array"):
+        grid, size = grids[0], (str(rows), str(columns))
+        if (of_grid := (grid.get("rows", size[0]), grid.get("cols", size[1]))) != size:
+            skin = f"the skin has {rows}x{columns} cells"
+            raise ValueError(f"an <array> of {'x'.join(of_grid)[:40]} taxels, {skin}")
+        is_plain = grid.get("order", "row-major") == "row-major"
+        if len(grids) > 1 or not is_plain or any(map(float, grid.get("offset", "0").split())):
+            raise ValueError(
+                "not one <array>, row-major and without an offset: leave no other in it"
+            )
         return {"pitch_m": numbers(grid, "spacing" if grid.get("spacing") else "size", 2)}
     taxels = []
     for taxel in sorted(tree.iter("taxel"), key=lambda taxel: int(taxel.get("idx", "0"))):
