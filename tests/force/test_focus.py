@@ -116,6 +116,17 @@ def test_focus_is_refused_for_a_method_that_takes_no_regions() -> None:
         ohmskin.open("emulator://8x8", calibration=of_skin, focus=True)
 
 
+@pytest.mark.parametrize(("told_us", "settle_us"), [(0, 100), (40, 40)])
+def test_lines_that_take_time_to_settle_have_it_in_a_region(told_us: int, settle_us: int) -> None:
+    """A board that was asked for 300 us read its regions, and the whole skin, with 20."""
+    skin = stepped("emulator://8x8?scene=single&begin=0")
+    skin.configure(rate_hz=10, settle_us=100)
+    with Focus(skin, Region(mode="near", settle_us=told_us)) as focus:
+        assert skin.info.settle_us >= 100
+        focus.follow(touched((3, 4)), 1, next(iter(skin)))
+        assert settle_us <= skin.info.settle_us < settle_us + 20
+
+
 def test_focus_needs_a_calibration() -> None:
     """Without one, the whole skin was read at its usual rate, and nothing said why."""
     with pytest.raises(ValueError, match="scans have with a calibration: give one"):

@@ -59,7 +59,8 @@ class Focus(Closing):
     """Tells a board where to read next, scan after scan, until it is closed.
 
     like: how the region is read, and the whole skin in between. Rows and columns are those of the
-        contacts, and `whole_every` is what `WHOLE_HZ` needs.
+        contacts, and `whole_every` is what `WHOLE_HZ` needs. Where `settle_us` is 0, it is the one
+        that the board was asked for.
 
     :raises CommandRefused: the board has no regions, or is a recording.
     :raises DeviceLost: the board does not answer.
@@ -67,7 +68,10 @@ class Focus(Closing):
     """
 
     def __init__(self, device: Device, like: Region = FOLLOWING) -> None:
-        self._device, self._like = device, like
+        # A settle time that the board was asked for is what the lines of this skin need.
+        self._settle_us = device.info.settle_asked_us
+        self._device = device
+        self._like = replace(like, settle_us=like.settle_us or self._settle_us)
         self._lines: Lines | None = None
         self._contact_count = 0
         self._lock, self._closed = threading.Lock(), False
@@ -113,7 +117,8 @@ class Focus(Closing):
     def _ask(self, lines: Lines | None) -> None:
         """Ask for these lines; None: for the whole skin."""
         if lines is None:
-            self._device.set_region(Region(mode=self._like.whole_mode))
+            whole = Region(mode=self._like.whole_mode, settle_us=self._settle_us)
+            self._device.set_region(whole)
             return
         cells = len(lines.rows) * len(lines.columns)
         for _ in range(_TRIES):
