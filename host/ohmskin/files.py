@@ -22,13 +22,16 @@ _LEFT_S: Final = 3600.0
 
 
 @contextmanager
-def naming(path: PathName) -> Iterator[None]:
-    """Put the file's name before the text of a ValueError from inside, and keep it one line."""
+def naming(what: PathName) -> Iterator[None]:
+    """Put this before the text of a ValueError from inside, and keep it one line.
+
+    what: what is wrong, such as a file or a field.
+    """
     try:
         yield
     except ValueError as error:
         reason = str(error).partition("\n")[0]
-        raise ValueError(f"{os.fspath(path)}: {reason}") from error
+        raise ValueError(f"{os.fspath(what)}: {reason}") from error
 
 
 def read_bounded(path: PathName, most_bytes: int) -> bytes:
