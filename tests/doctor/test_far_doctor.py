@@ -206,6 +206,15 @@ def test_far_ends_are_judged_with_all_wires(wires: float) -> None:
         assert told(f"{FAR}&wires={wires}&noise=0.4&{fault}") == [FOUND[fault]]
 
 
+@pytest.mark.parametrize(
+    ("size", "fault"), [("2x2", "row=0"), ("2x8", "row=0"), ("8x2", "column=1")]
+)
+def test_an_open_far_end_is_named_where_a_layer_has_two_lines(size: str, fault: str) -> None:
+    """Nobody can say which of the two leads is the usual one."""
+    found = ("open_far", f"far end of {fault.replace('=', ' ')}")
+    assert told(f"emulator://{size}?mode=far&open_far_{fault}") == [found]
+
+
 def test_several_faults_are_named_at_once() -> None:
     ends = "swap_far_rows=1,2&open_far_column=5"
     assert sorted(told(f"{FAR}&{ends}&broken_row=6,3&crimp_column=2&dead=0,0")) == [

@@ -277,6 +277,8 @@ class _Layer:
         precision, lead_ohm = precision[tells], pull[tells] / precision[tells]
         off_stds = np.abs(lead_ohm - np.median(lead_ohm)) * precision**0.5
         weight = np.where(off_stds < FEW_STDS, precision, 0.0)
+        if not weight.any():  # the median of two lines that differ is far from both
+            return 0.0, np.inf
         return float(np.average(lead_ohm, weights=weight)), float(weight.sum() ** -0.5)
 
     def _fit(self, mean_ohm: Float, prior: Float) -> Fit:
