@@ -8,6 +8,7 @@ import csv
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -20,7 +21,7 @@ import pytest
 from mcap.reader import make_reader
 
 import ohmskin
-from command_line import Command, Done, Run, assert_one_line, finish, well
+from command_line import Command, Done, Run, assert_one_line, finish, python, well
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import CommandRefused, DeviceLost, PortError, RecordingEnded, RecordingError
 from ohmskin.estimate.methods import make_estimator
@@ -537,6 +538,15 @@ def test_typed_lines_become_marks(path: Path, command: Command) -> None:
         process.send_signal(signal.SIGINT)
         assert finish(process).code == 0
     assert [mark.text for mark in load_recording(path).marks] == ["left hand", "right hand"]
+
+
+def test_a_recording_goes_on_in_the_background_of_a_shell(path: Path) -> None:
+    """Whoever reads the terminal from there is stopped, unless it ignores the signal."""
+    spawn = "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))"
+    shell = ("bash", "-mc", '"$@" & wait %1', "shell", sys.executable, "-m", "ohmskin")
+    done = python("-c", spawn, *shell, "record", URL, path, "--scans", "60", TERM="dumb")
+    assert f"{path}: 60 scans, missed 0" in done.out
+    assert done.code == 0
 
 
 def test_the_commands(tmp_path: Path, command: Command, run: Run) -> None:

@@ -2,6 +2,7 @@
 """``ohmskin record``, ``export`` and ``estimate``: scans in files."""
 
 import os
+import signal
 import sys
 import threading
 from collections import Counter
@@ -108,6 +109,10 @@ def record(
                 stack.enter_context(live)
                 look = display.look
         if sys.stdin is not None and sys.stdin.isatty():
+            if hasattr(signal, "SIGTTIN"):
+                # In the background of a shell, a terminal that is read stops the whole process.
+                # Where the signal is ignored, reading fails there instead, and no marks are taken.
+                signal.signal(signal.SIGTTIN, signal.SIG_IGN)
             # A thread, because the end of the recording must not wait for a line.
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
