@@ -221,6 +221,11 @@ def test_hum_that_stands_still_shows_at_another_rate() -> None:
         assert finding.kind is Kind.HUM
 
 
+@pytest.mark.parametrize("url", ["8x8?hum=50&rate=50", "8x8?hum=60&rate=60", "4x4?hum=50&rate=50"])
+def test_hum_that_stands_still_is_no_fault_of_the_references(url: str) -> None:
+    assert told(f"emulator://{url}") == [("hum", "whole skin")]
+
+
 def test_hum_is_not_seen_in_noise_or_in_other_tones() -> None:
     for noise in (1.0, 3.0, 10.0):
         assert "hum" not in dict(told(f"emulator://4x4?noise={noise}"))

@@ -76,8 +76,10 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     if settled is not None and not moves:
         is_too_short = examine_settling(usual, settled, diagnosis)
         # In mode far, wires change readings by few codes. So a part of a code counts, which the
-        # usual settle time leaves even where it is not too short.
-        if is_too_short or far:
+        # usual settle time leaves even where it is not too short. A hum that stands still at the
+        # usual rate is a part of the usual means.
+        stands_still = bool(diagnosis.measured["hum_lsb"] and usual.hidden_hz)
+        if is_too_short or far or stands_still:
             scans = settled
     if presses is not None:
         presses.examine_settling(evidence.pressed, diagnosis)
