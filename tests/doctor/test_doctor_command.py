@@ -199,6 +199,18 @@ def test_a_wrong_use_is_one_line(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("benches")
+def test_a_calibration_of_another_skin_takes_no_wires(run: Run, tmp_path: Path) -> None:
+    own, others = tmp_path / "own.json", tmp_path / "others.json"
+    told = calibration(Scene("rest", 8, 8).rest_ratio)
+    told.save(own)
+    replace(told, unit_id=99).save(others)
+    before, url = others.read_bytes(), "emulator://8x8?scene=corners&wires=1.5"
+    done = run("doctor", url, "--calibration", str(own), "--press", "--into", str(others))
+    assert_one_line(done, "this calibration is of unit 99")
+    assert others.read_bytes() == before
+
+
+@pytest.mark.usefixtures("benches")
 def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path: Path) -> None:
     path, told = tmp_path / "skin.json", calibration(Scene("rest", 8, 8).rest_ratio)
     for wire_ohm, more, names in (

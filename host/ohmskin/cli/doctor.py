@@ -50,12 +50,12 @@ def doctor(
     wires of all lines are measured without, and --into takes them. Exit code 0: sound; 1: something
     is wrong, or nobody pressed.
     """
-    calibration = calibration or into
-    of_board = None if calibration is None else load_calibration(calibration)
+    paths = filter(None, (calibration, into))
+    known = [load_calibration(path) for path in paths]  # the first one tells the wires
     told = wires_of(wires, leads)
-    if of_board is not None:
+    if known:
         given = {name: ohm for name, ohm in told._asdict().items() if ohm is not None}
-        told = of_board.nominal_wire_ohm._replace(**given)
+        told = known[0].nominal_wire_ohm._replace(**given)
     with terminal() as report:
         try:
             device = ohmskin.open(port, start=False)
@@ -63,8 +63,8 @@ def doctor(
             diagnosis = Diagnosis([_unanswered(port, exc)])
         else:
             with device:
-                if of_board is not None:
-                    of_board.check(device.info)
+                for each in known:
+                    each.check(device.info)
                 if device.info.mode == "far":
                     if press:
                         raise ValueError("mode far shows the wires untouched: leave out --press")
