@@ -2,6 +2,7 @@
 """``calibrate knead`` and ``weights --anywhere``: emulated skins, and how near to the truth."""
 
 import re
+import signal
 from itertools import islice
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from ohmskin.cli.knead import KneadMap
 from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import load_calibration
+from ohmskin.link.messages import Scan
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recording, Tare, load_recording
 from stepped import stepped
@@ -76,6 +78,28 @@ def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
     assert known[-1] < now[-1]
     assert len(list(tmp_path.glob("skin.knead-*.mcap"))) == 2
     assert load_calibration(out).model.slope_std.max() < first.model.slope_std.max()
+
+
+@pytest.mark.parametrize("ends", [20, 60, 90], ids=["amid the tare", "unpressed", "pressed once"])
+def test_an_early_ctrl_c_is_no_error_and_kneading_goes_on(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: int
+) -> None:
+    look = KneadMap.look
+
+    def interrupted(shown: KneadMap, scan: Scan) -> None:
+        look(shown, scan)
+        if scan.number == ends:
+            signal.raise_signal(signal.SIGINT)
+
+    out = tmp_path / "skin.json"
+    command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3", str(out), *TRUTH)
+    with monkeypatch.context() as patch:
+        patch.setattr(KneadMap, "look", interrupted)
+        done = well(run(*command))
+    assert re.search(r"no calibration is made \(.+\): the same command goes on\n$", done.out)
+    assert not out.exists()
+    well(run(*command, "--seconds", "11"))
+    assert out.exists()
 
 
 def test_fingertips_wait_until_somebody_reads() -> None:

@@ -279,7 +279,13 @@ def knead(
         return ForceSensor(force_port, force_baud, force_scale, force_unit, force_column)
 
     given, known = kneaded(port, out, sensor_of, seconds)
-    _learn_totals(calibrator_of, given, out)
+    try:
+        _learn_totals(calibrator_of, given, out)
+    except ValueError as exc:
+        if known or seconds:
+            raise
+        TERMINAL.print(f"no calibration is made ({exc}): the same command goes on")
+        return
     if not known:
         TERMINAL.print("not all cells are known yet: the same command goes on")
 
