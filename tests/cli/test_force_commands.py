@@ -12,6 +12,7 @@ import pytest
 from calibrations import half_doubtful, of_scene
 from command_line import Run, assert_one_line, well
 from ohmskin.force.calibration import load_calibration
+from ohmskin.force.reader import SkinReader
 
 GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 REST = "emulator://8x8?seed=1"
@@ -58,6 +59,16 @@ def test_stream_says_which_forces_are_uncertain(run: Run, tmp_path: Path) -> Non
     assert cells.count("?") == cells.count(".") == 32
     scan = json.loads(well(run(*arguments, "1", "--json")).out)  # programs get numbers
     assert scan["contacts"][0]["force_n"] == scan["force_n"][2][2] > 1
+
+
+def test_a_force_of_unknown_deviation_is_uncertain(
+    run: Run, skin: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = SkinReader.read
+    unknown = {"force_n_std": np.full((8, 8), np.nan)}
+    monkeypatch.setattr(SkinReader, "read", lambda self, scan: replace(read(self, scan), **unknown))
+    done = well(run("stream", GHOST, "--calibration", str(skin), "--scans", "1"))
+    assert done.out.partition("uncertain\n")[2].partition("contact")[0].count("?") == 64
 
 
 def test_stream_tares(run: Run, skin: Path) -> None:

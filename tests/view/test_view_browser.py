@@ -237,6 +237,18 @@ def test_no_value_below_its_deviation_is_written(page: Any) -> None:
     assert said(20e-6, float("nan"), 1) == "uncertain"
 
 
+def test_a_contact_of_unknown_deviation_is_uncertain(page: Any) -> None:
+    """JSON says null, which JavaScript takes for the least deviation of all."""
+    amounts = page.evaluate(
+        """async () => {
+            const { Panel } = await import(new URL("panel.js", location));
+            const contacts = [[1, 2, 2, 1.66, null], [2, 5, 2, 1.66, 0.02]];
+            return Panel.prototype.amounts({ force: [], contacts }, { briefly: false });
+        }"""
+    )
+    assert amounts == ["uncertain", "1.66 ± 0.02 N"]
+
+
 def test_what_is_off_the_scale_is_marked(page: Any) -> None:
     panel = open_board(page, "emulator://8x8?scene=single&begin=0&seed=1")
     has_text(panel, ".estimate .count", "1 cell touched")

@@ -171,8 +171,8 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
     if reader.has_forces:
         title = f"{skin.name}: force by '{reader.method}' [N], ?: uncertain"
         least_n = np.where(shown.estimate.touched, 0.0, KNOWN_N)
-        uncertain = shown.force_n_std > np.maximum(shown.force_n, least_n)
-        table = coloured(np.where(uncertain, np.nan, shown.force_n), FULL_SCALE_N)
+        known = shown.force_n_std <= np.maximum(shown.force_n, least_n)  # no NaN is
+        table = coloured(np.where(known, shown.force_n, np.nan), FULL_SCALE_N)
         contacts = (
             f"contact {one.identity}: {one.force_text} at ({one.row:.1f}, {one.column:.1f})"
             for one in shown.contacts

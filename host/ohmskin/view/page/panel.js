@@ -403,7 +403,7 @@ export class Panel {
   amounts({ force, contacts }, { briefly }) {
     const [unit, size] = force ? ["N", 1] : ["µS", 1e6];
     return contacts.map(([, , , amount, std]) => {
-      if (!(std <= amount)) return "uncertain";
+      if (std === null || !(std <= amount)) return "uncertain"; // null: not known
       const [text, spread] = writtenWith(size * amount, size * std);
       return briefly ? `${text} ${unit}` : `${text} ± ${spread} ${unit}`;
     });
