@@ -31,6 +31,13 @@ def assert_refused(client: TestClient, path: str = "/boards/0", **headers: str) 
         pass
 
 
+def assert_gone(client: TestClient, path: str) -> None:
+    """A page that asks again for a board that was closed is told so, and asks no more."""
+    own = {"host": HOST, "origin": ORIGIN}
+    with client.websocket_connect(path, headers=own) as socket:
+        assert socket.receive() == {"type": "websocket.close", "code": 4001, "reason": ""}
+
+
 BAD_PORTS = ("", "[]", "{", '{"port": 3}', '{"port": " "}', '{"port": "a\\u0000"}', "[" * 5000)
 
 
@@ -57,7 +64,7 @@ def test_a_port_is_opened_and_closed_from_the_page() -> None:
             assert closed.value.code == 4001
         assert client.get("/boards").json() == []
         assert client.post("/boards", json={"port": REST}, headers=own).json()["number"] == 1
-        assert_refused(client, host=HOST, origin=ORIGIN)
+        assert_gone(client, "/boards/0")
 
 
 BAD = [
@@ -76,7 +83,7 @@ def test_a_number_that_python_does_not_read_is_no_board() -> None:
         for number in ("9" * 10, "9" * 5000, "\u0663"):
             assert client.delete(f"/boards/{number}", headers={"origin": ORIGIN}).status_code == 204
             assert client.get(f"/boards/{number}").status_code == 405
-            assert_refused(client, f"/boards/{number}", host=HOST, origin=ORIGIN)
+            assert_gone(client, f"/boards/{number}")
         with panel(client) as page:
             page.scan()
 

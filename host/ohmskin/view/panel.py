@@ -24,7 +24,7 @@ from ohmskin.view.boards import Shown, ViewedBoard
 
 # The close code of a websocket whose board was closed, by this page or by another. page/wire.js has
 # the same. Chosen: one of 4000 to 4999, which RFC 6455 leaves to programs.
-_GONE_CODE: Final = 4001
+GONE_CODE: Final = 4001
 # A larger time of a page's clock is not sent back [ms], because JavaScript reads numbers that are
 # too large as infinite. Chosen: a page counts from its beginning, and 1e15 ms are 30,000 years.
 _MOST_MS: Final = 1e15
@@ -71,8 +71,8 @@ class Panel:
             await self._news.wait()
             self._news.clear()
             if self._board.closing.is_set():
-                await self._socket.close(_GONE_CODE)
-                raise WebSocketDisconnect(_GONE_CODE)
+                await self._socket.close(GONE_CODE)
+                raise WebSocketDisconnect(GONE_CODE)
             state, shown = self._board.state(), self._board.shown
             if state != said:
                 said = state
@@ -95,7 +95,7 @@ class Panel:
             await sending
         except RuntimeError as exc:
             if "after sending 'websocket.close'" in str(exc):
-                raise WebSocketDisconnect(_GONE_CODE) from exc
+                raise WebSocketDisconnect(GONE_CODE) from exc
             raise
 
     async def _receive(self, tasks: TaskGroup) -> None:

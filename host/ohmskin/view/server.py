@@ -32,7 +32,7 @@ from ohmskin.errors import OhmskinError
 from ohmskin.link.serial_port import serial_ports
 from ohmskin.view.boards import LONGEST_TEXT_CHARS, MOST_BOARDS, ViewedBoards, load_all
 from ohmskin.view.connections import Server, Waiting
-from ohmskin.view.panel import Panel
+from ohmskin.view.panel import GONE_CODE, Panel
 
 # The port of the page, unless told. Chosen: few other programs use it.
 HTTP_PORT: Final = 8765
@@ -114,7 +114,11 @@ class _BoardList:
     async def panel(self, socket: WebSocket) -> None:
         """Show a board until its page goes."""
         board = self._boards.get(self._number(socket))
-        if board is None or self._panels >= MOST_PANELS:
+        if board is None:
+            await socket.accept()  # else the page cannot see the code
+            await socket.close(GONE_CODE)
+            return
+        if self._panels >= MOST_PANELS:
             await socket.close()
             return
         self._panels += 1
