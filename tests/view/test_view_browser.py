@@ -464,6 +464,31 @@ def test_a_board_that_is_pulled_out_is_said_and_comes_back(
     has_text(panel, ".estimate .count", "3 cells touched")
 
 
+def test_a_board_of_another_size_is_shown_as_if_it_were_the_first(
+    page: Any, pty_board: Serve, tmp_path: Path
+) -> None:
+    port = tmp_path / "skin"
+    first = pty_board("emulator://8x4?scene=single&begin=0&unit=3")
+    port.symlink_to(first.path)
+    panel = open_board(page, str(port))
+    switch(panel, "Table")
+    has_text(panel, ".chosen", r"\(4, 2\)")
+    has_text(panel, ".notice p", "no forces: ")
+    heads = "table => [...table.tHead.rows].map(row => row.cells.length)"
+    port.unlink()
+    first.close()
+    has_text(panel, ".status", "not there")
+    second = pty_board(GHOST)
+    port.symlink_to(second.path)
+    has_text(panel, ".board", "8 × 8 cells")
+    has_text(panel, ".values caption", r"force \[N\]")
+    page.wait_for_timeout(2500)  # the table is renewed once a second
+    assert panel.locator(".values table").evaluate(heads) == [9]
+    assert panel.locator(".values tbody tr").first.locator("td").count() == 8
+    has_text(panel, ".chosen", r"\(2, 2\)")
+    assert panel.locator(".notice p").inner_text() == ""
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_two_boards_on_a_phone(new_page: Callable[..., Any], scheme: str) -> None:
     page = new_page(viewport=PHONE, color_scheme=scheme, device_scale_factor=2, has_touch=True)

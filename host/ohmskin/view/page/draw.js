@@ -234,8 +234,6 @@ export class History {
   }
 
   add(scan) {
-    const newest = this.scans.at(-1);
-    if (newest && newest.siemens.length !== scan.siemens.length) this.scans = [];
     this.scans.push(scan);
     const oldest = scan.host_time_s - CURVE_S;
     while (this.scans[0].host_time_s < oldest || this.scans.length > SCANS_KEPT) this.scans.shift();

@@ -71,6 +71,10 @@ export class Panel {
       state: (state) => this.take(state),
       notice: (notice) => this.notice(notice),
       scan: (scan) => {
+        if (scan.rows !== this.scan?.rows || scan.columns !== this.scan?.columns) {
+          this.chosen = null;
+          this.history = new History();
+        }
         this.history.add(scan);
         this.scan = scan;
         this.element.classList.add("seen");
@@ -262,7 +266,8 @@ export class Panel {
       this.find(".advice"),
       date || !board ? "" : "Press Tare while nothing touches the skin: light touches show better.",
     );
-    if (state.note) this.notice({ text: state.note });
+    if (state.note || this.noted) this.notice({ text: state.note });
+    this.noted = Boolean(state.note);
     this.rescale();
   }
 
@@ -459,7 +464,10 @@ export class Panel {
       Array.from({ length: columns }, (_, column) => this.value(row * columns + column));
     const head = ["row", ...Array.from({ length: columns }, (_, column) => `column ${column}`)];
     if (!table.tHead || table.tHead.rows[0].cells.length !== columns + 1) {
-      table.replaceChildren(table.createCaption(), table.createTHead(), table.createTBody());
+      table.replaceChildren(); // else those below are the old ones
+      table.createCaption();
+      table.createTHead();
+      table.createTBody();
       table.tHead.insertRow().append(
         ...head.map((text) => {
           const cell = document.createElement("th");
