@@ -376,6 +376,16 @@ def test_a_calibration_of_another_unit_is_not_taken_unless_forced() -> None:
         assert "force" in page.scan()
 
 
+def test_a_calibration_whose_method_takes_whole_scans_is_not_taken_in_mode_half() -> None:
+    by_voltage = of_scene("ghost", method="voltage", siemens=0.01)
+    with served(f"{GHOST}&mode=half", calibrations=[by_voltage]) as client, panel(client) as page:
+        assert "force" not in page.scan()
+        assert "'voltage' takes whole scans, the board scans in mode half" in page.state["note"]
+    both = [by_voltage, of_scene("ghost")]
+    with served(f"{GHOST}&mode=half", calibrations=both) as client, panel(client) as page:
+        assert "force" in page.scan()
+
+
 def test_a_replay_shows_the_tare_of_the_recording_and_ends(tmp_path: Path) -> None:
     path, bench = tmp_path / "skin.mcap", stepped(GHOST)
     tare = Tare(Scene("ghost", 8, 8, seed=1).rest_ratio, 0.0)

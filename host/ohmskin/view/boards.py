@@ -300,9 +300,16 @@ class ViewedBoard(LiveSkin):
         self._note = note = ""
         for calibration in self._calibrations:
             try:
-                return SkinReader(board, calibration, force=self._force)
+                reader = SkinReader(board, calibration, force=self._force)
             except ValueError as exc:
                 note = f"no forces: {exc}"
+                continue
+            if reader.method in _methods(reader):
+                return reader
+            note = (
+                f"no forces: '{reader.method}' takes whole scans, the board scans in mode "
+                f"{board.mode}: 'ohmskin configure PORT --mode near'"
+            )
         self._note = note
         return SkinReader(board)
 
