@@ -77,6 +77,17 @@ def test_readings_that_the_self_test_did_not_take_are_not_called_sound(
     assert "none, but other readings came too late to be judged" in page
 
 
+@pytest.mark.parametrize("form", [(), ("--json",)])
+def test_findings_of_the_self_test_are_in_the_exit_code(
+    run: Run, monkeypatch: pytest.MonkeyPatch, form: tuple[str, ...]
+) -> None:
+    report = SelfTestReport(("top_stuck_low",), (0,) * 8, (9,) * 8)
+    monkeypatch.setattr(Session, "self_test", lambda _: report)
+    done = run("info", EMULATED, "--self-test", *form)
+    assert (done.code, done.err) == (1, "")
+    assert "top_stuck_low" in done.out
+
+
 def test_info_is_in_peoples_units(run: Run) -> None:
     said = dict(re.findall(r"^ ([a-z ]+?)  +(.*?) *$", well(run("info", EMULATED)).out, re.M))
     assert said["cells"] == "4 rows, 6 columns"

@@ -98,11 +98,11 @@ def info(
     with ohmskin.open(port, start=False) as skin:
         board = skin.info
         tested = skin.self_test() if self_test else None
+    findings = tested.findings if tested else ()
     if as_json:
         facts: dict[str, Any] = {**asdict(board), "rate_hz": round(board.rate_hz, 4)}
         print(json.dumps(facts | (asdict(tested) if tested else {})))  # noqa: T201
-        return
-    findings = tested.findings if tested else ()
+        raise SystemExit(bool(findings))
     table = Table(box=None, show_header=False)
     for name, text in _board_in_words(board).items():
         table.add_row(name, text)
