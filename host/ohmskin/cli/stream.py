@@ -129,7 +129,8 @@ def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan])
         try:
             print(json.dumps(line), flush=True)  # noqa: T201
         except BrokenPipeError:
-            sys.stderr.close()  # the reader, such as `head`, has had enough
+            # The reader, such as `head`, has had enough. Python writes what is left when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return
 
 
