@@ -3,6 +3,7 @@
 
 import csv
 import json
+import sys
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -12,10 +13,11 @@ import pytest
 
 import ohmskin
 from calibrations import of_scene
-from command_line import Run, well
+from command_line import Run, assert_one_line, well
 from ohmskin.errors import OhmskinError
 from ohmskin.force.reader import ForceScan
 from ohmskin.force.tables import export, load_forces
+from ohmskin.record.readings import load_readings
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Mark
 from stepped import stepped
@@ -124,12 +126,40 @@ def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: R
     assert (done.code, "a folder takes several recordings" in done.err) == (2, True)
 
 
+def test_readings_are_exported_where_the_environment_names_a_calibration(
+    recorded: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_scene("ghost").save(tmp_path / "skin.json")
+    monkeypatch.setenv("OHMSKIN_CALIBRATION", str(tmp_path / "skin.json"))
+    well(run("export", str(recorded), str(tmp_path / "out.npz")))
+    assert load_readings(tmp_path / "out.npz").ratio.shape == (30, 8, 8, 4)
+
+
+def test_a_format_that_the_file_has_not_is_refused(
+    recorded: Path, tmp_path: Path, run: Run
+) -> None:
+    words = ("export", str(recorded), str(tmp_path / "out.npz"), "--format")
+    assert_one_line(run(*words, ".csv"), "--format .csv is of files in a folder")
+    assert not (tmp_path / "out.npz").exists()
+    well(run(*words, ".npz"))
+
+
+def test_without_dask_it_says_what_to_install(
+    recorded: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("joblib")
+    monkeypatch.setitem(sys.modules, "dask", None)
+    (again := tmp_path / "b.mcap").write_bytes(recorded.read_bytes())
+    done = run("export", str(recorded), str(again), str(tmp_path), "--backend", "dask")
+    assert_one_line(done, "run pip install 'dask[distributed]'")
+
+
 def test_what_cannot_be_written(recorded: Path, tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(ValueError, match=r"there are \.npz, \.csv, \.parquet"):
         export(recorded, tmp_path / "a.xls", of_scene("ghost"))
     with pytest.raises(ValueError, match="of unit 5"):
         load_forces(recorded, replace(of_scene("ghost"), unit_id=5))
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(OhmskinError, match="run pip install pyarrow"):
         export(recorded, tmp_path / "a.parquet", of_scene("ghost"))
     assert not list(tmp_path.iterdir())

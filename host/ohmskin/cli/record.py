@@ -229,10 +229,8 @@ def export(
         float, Option("--begin", min=0, help="from so long after the first scan, in s")
     ] = 0.0,
     end_s: Annotated[float, Option("--end", min=0, help="until then, in s; 0: to the last")] = 0.0,
-    calibration: Annotated[
-        Path | None, Option(envvar="OHMSKIN_CALIBRATION", help="forces in place of readings")
-    ] = None,
-    kind: Annotated[str, Option("--format", help="of the files in a folder")] = ".npz",
+    calibration: Annotated[Path | None, Option(help="forces in place of readings")] = None,
+    kind: Annotated[str, Option("--format", help="of the files in a folder; default: .npz")] = "",
     backend: Annotated[str, Option(help="joblib's, where a folder is written: dask")] = "loky",
 ) -> None:
     """Write recordings as .npz or .csv: readings, or forces by a calibration.
@@ -240,7 +238,10 @@ def export(
     Recordings that go into a folder are read by all cores at once. .parquet needs pyarrow.
     """
     known = None if calibration is None else load_calibration(calibration)
-    pairs = [(path, out / f"{path.stem}{kind}" if out.is_dir() else out) for path in recordings]
+    is_folder, name_end = out.is_dir(), kind or ".npz"
+    if not is_folder and kind not in ("", out.suffix):
+        raise ValueError(f"--format {kind} is of files in a folder, and {out} is none")
+    pairs = [(path, out / f"{path.stem}{name_end}" if is_folder else out) for path in recordings]
     if len({to for _, to in pairs}) < len(pairs):
         raise ValueError(f"{out}: a folder takes several recordings, of different names")
     for path, to in pairs:
@@ -278,7 +279,8 @@ def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any) -> list[P
             bar = stack.enter_context(_bar())
             return list(bar.track(done, total=len(pairs), description="recordings"))
     except ImportError as exc:
-        raise OhmskinError(f"several recordings need {exc.name}: run pip install joblib") from exc
+        needed = "joblib" if exc.name == "joblib" else "'dask[distributed]'"
+        raise OhmskinError(f"this needs {needed}: run pip install {needed}") from exc
 
 
 def estimate(
