@@ -53,6 +53,17 @@ def test_tables_and_live_pictures_show_text_alone(text: str) -> None:
     assert "\x1b[2J" not in file.getvalue()
 
 
+def test_names_of_files_are_text(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # with the bar that a terminal shows
+    whole, cut, out = (tmp_path / name for name in ("a.mcap", "c\x1b[2Jut.mcap", "[red]left.npz"))
+    write_recording(whole, stepped(URL).info, map(scan, range(200)))
+    cut.write_bytes(whole.read_bytes()[:-200])
+    said = run("export", str(cut), str(out)).err
+    assert f"{tmp_path}/c?[2Jut.mcap was cut off" in said
+    assert "[red]left.npz" in said
+    assert "\x1b[2J" not in said
+
+
 def test_an_error_shows_text_alone(run: Run) -> None:
     done = run("estimate", "no\x1b[2J\nfile.npz", "--method", "ohm", "--out", "x.npz")
     assert done.err.startswith("ohmskin: no?[2J file.npz: ")

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, TypeVar
 import numpy as np
 from rich.console import Group
 from rich.live import Live
-from rich.progress import Progress, TimeElapsedColumn
+from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 from typer import Argument, Option
 
@@ -164,7 +164,8 @@ def progress(what: str) -> Callable[[Iterable[_T]], Iterable[_T]]:
 
 
 def _bar() -> Progress:
-    columns = (*Progress.get_default_columns(), TimeElapsedColumn())
+    what = TextColumn("{task.description}", style="progress.description", markup=False)
+    columns = (what, *Progress.get_default_columns()[1:], TimeElapsedColumn())
     return Progress(*columns, console=_errors, transient=True, disable=not _errors.is_terminal)
 
 
@@ -259,7 +260,8 @@ def export(
     for (path, to), written in zip(pairs, done, strict=True):
         TERMINAL.print(f"{to}: {written.scans} scans")
         if written.cut_off:
-            print(f"{path} was cut off: its last second may be missing", file=sys.stderr)  # noqa: T201
+            text = f"{path} was cut off: its last second may be missing"
+            _errors.print(text, soft_wrap=True, highlight=False)
 
 
 def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any) -> list[Part]:
