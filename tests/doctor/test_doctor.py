@@ -287,6 +287,11 @@ def test_settling_says_how_long_is_enough() -> None:
         assert examine(gather(bench)).findings == []
 
 
+@pytest.mark.parametrize("url", ["8x8?tau_us=50", "2x2?tau_us=3000", "16x16?tau_us=200"])
+def test_a_skin_that_settles_slowly_is_not_called_touched(url: str) -> None:
+    assert [kind for kind, _ in told(f"emulator://{url}")] == ["settling"]
+
+
 def test_second_look_is_what_a_board_takes() -> None:
     for url in ("1x1", "1x1?rate=50", "2x2?rate=1", "16x16", "16x16?rate=1", "16x16?rate=0", "8x8"):
         bench = stepped(f"emulator://{url}")

@@ -72,7 +72,7 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     """
     settled, presses, far = evidence.settled, evidence.presses, usual.board.mode == "far"
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
-    moves, scans = bool(moved.any()), usual
+    moves, scans, is_too_short = bool(moved.any()), usual, False
     if settled is not None and not moves:
         is_too_short = examine_settling(usual, settled, diagnosis)
         # In mode far, wires change readings by few codes. So a part of a code counts, which the
@@ -95,7 +95,8 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
         examine_far(rest, near, diagnosis)
     # A cell that moves in all may conduct no more on average than one at rest.
     touched = near.touched if near.touched.any() else moved
-    if touched.any():
+    # Where even a longer settle time is too short, untouched cells look touched.
+    if touched.any() and not is_too_short:
         diagnosis.add(Kind.TOUCHED, Place.of_cells(touched), moves=moves)
     # What else is wrong with a skin may look like leaks.
     is_faulty = any(one.kind.severity is Severity.FAULT for one in diagnosis.findings)
