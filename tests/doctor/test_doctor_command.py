@@ -2,6 +2,7 @@
 """``ohmskin doctor`` as a command: what it asks for, what it prints, what it leaves behind."""
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -72,6 +73,14 @@ def test_page_and_json(run: Run) -> None:
     assert row["values"] == {"line_count": 8, "cells_per_line": 8}
     assert cell["place"]["cells"] == [[1, 2]]
     assert answer["measured"]["rows"] == 8
+
+
+@pytest.mark.usefixtures("benches")
+def test_what_no_longer_settle_time_has_shown_is_not_known(run: Run) -> None:
+    """At 1 Hz, the settle time is as long as any."""
+    slow = "emulator://8x8?rate=1"
+    assert re.search(r"\nsettling_lsb +not known\n", well(run("doctor", slow)).out)
+    assert json.loads(run("doctor", slow, "--json").out)["measured"]["settling_lsb"] is None
 
 
 def test_wires_are_measured_where_somebody_presses(run: Run, benches: list[SteppedSkin]) -> None:

@@ -161,7 +161,7 @@ def print_page(page: dict[str, Any]) -> None:
         show("")
     for name, value in page["measured"].items():
         shown = ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
-        show(f"{name:<18}  {shown}")
+        show(f"{name:<18}  {'not known' if shown is None else shown}")
     if page["lines"]:
         show("\nwires [ohm]         end to end    by segment, from the near end; ?: not known")
     for line in page["lines"]:

@@ -418,7 +418,7 @@ def examine_settling(
         mean of a cell's four readings counts, as in estimates. What floating lines draw while they
         charge changes each reading, but hardly their mean.
     """
-    diagnosis.measured["settling_lsb"] = 0.0
+    diagnosis.measured["settling_lsb"] = None
     if settled.board.settle_us <= NOT_LONGER * usual.board.settle_us:
         return False
     mean = each_lsb is None and usual.board.mode == "near"
