@@ -19,7 +19,7 @@ from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.link.device import Device
 from ohmskin.record.recording import Tare, load_recording
 from ohmskin.view import boards
-from ohmskin.view.boards import MOST_BOARDS, ViewedBoards
+from ohmskin.view.boards import MOST_BOARDS, ViewedBoard, ViewedBoards
 from ports import Serve
 from recordings import write_recording
 from stepped import stepped
@@ -194,6 +194,21 @@ def test_the_board_follows_contacts_if_it_shall(tmp_path: Path) -> None:
         assert not page.state["focus"]
     (path,) = tmp_path.glob("*.mcap")
     assert {scan.is_whole for scan in load_recording(path).scans} == {True, False}
+
+
+def test_a_silent_board_whose_contacts_are_followed_is_closed_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers, waited = threading.Event(), list[bool]()
+    monkeypatch.setattr(boards.Focus, "close", lambda _: waited.append(answers.wait(20)))
+    board = ViewedBoard(REST, [], tmp_path)
+    until(lambda: board.opened)
+    board.follow(True)
+    board.close()
+    assert board.ended
+    assert waited == []
+    answers.set()
+    until(lambda: waited == [True])
 
 
 @pytest.mark.parametrize("calibrated", [True, False])

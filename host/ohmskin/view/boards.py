@@ -47,6 +47,9 @@ MOST_BOARDS: Final = 16
 # A text that is typed at the page, a port or a mark, has at most so many characters. Chosen: far
 # longer than anybody types, and short enough for a line of an error.
 LONGEST_TEXT_CHARS: Final = 1000
+# `ViewedBoard.close` waits at most so long for the end of the focus [s]. Chosen: a board answers in
+# a tenth of this time.
+_FOCUS_ENDS_S: Final = 0.5
 # Attributes of `Hello` that the page shows of a board.
 _OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns", "mode")
 # Numbers of a `Contact` that the page shows.
@@ -336,7 +339,10 @@ class ViewedBoard(LiveSkin):
 
     def close(self) -> None:
         """End reading. A recording is whole after that. May be called again."""
-        self._end_focus()
+        # A board that has fallen silent lets this thread wait until its port is closed.
+        ends = threading.Thread(target=self._end_focus, daemon=True)
+        ends.start()
+        ends.join(_FOCUS_ENDS_S)
         super().close()
         self._gone()
 
