@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibrations import of_scene
-from command_line import Run, well
+from command_line import Run, assert_one_line, well
 from ohmskin.force.calibration import load_calibration
 
 
@@ -53,3 +53,21 @@ def test_a_pitch_is_two_numbers(file: Path, run: Run, pitch: str) -> None:
     done = run("skin", str(file), "--pitch-mm", pitch)
     assert (done.code, done.out) == (2, "")
     assert "--pitch-mm wants two numbers" in done.err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--frame", "palm"), "nobody has said where the cells are: say --pitch-mm"),
+        (("--picture", "p.svg"), "nobody has said where the cells are: say --pitch-mm"),
+        (("--pitch-mm", "10,10", "--picture", "/no/such/p.svg"), "/no/such/p.svg: cannot"),
+        (("--pitch-mm", "0,10"), "two numbers above 0, not '0,10'"),
+        (("--pitch-mm", "10,10", "--taxels", "taxels.txt"), "either --taxels, or --pitch-mm"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_and_the_file_is_as_it_was(
+    file: Path, run: Run, options: tuple[str, ...], words: str
+) -> None:
+    before = file.read_bytes()
+    assert_one_line(run("skin", str(file), *options), words)
+    assert file.read_bytes() == before

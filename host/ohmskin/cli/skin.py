@@ -30,6 +30,12 @@ def skin(
 ) -> None:
     """Show a calibration file; say where its cells are, and draw them."""
     known = load_calibration(file)
+    if taxels is not None and (pitch_mm or radius_mm):
+        raise ValueError("say either --taxels, or --pitch-mm and --radius-mm")
+    if known.geometry is None and (frame or drawing) and not (taxels or pitch_mm or radius_mm):
+        raise ValueError("nobody has said where the cells are: say --pitch-mm 10,10, too")
+    if drawing is not None:
+        check_place(drawing, file)
     placed, frame = known.geometry, frame or (known.geometry.frame_id if known.geometry else "skin")
     if taxels is not None:
         placed = Geometry.of_file(taxels, known.rows, known.columns, frame)
@@ -37,6 +43,8 @@ def skin(
         if not re.fullmatch(r"[\d.]+,[\d.]+", pitch_mm):
             raise ValueError(f"--pitch-mm wants two numbers, as 10,10, not '{pitch_mm}'")
         told = {"pitch_m": 1e-3 * np.array([float(mm) for mm in pitch_mm.split(",")])}
+        if not told["pitch_m"].all():
+            raise ValueError(f"--pitch-mm wants two numbers above 0, not '{pitch_mm}'")
         if radius_mm:
             told["radius_m"] = np.array(1e-3 * radius_mm)
         kind = "cylinder" if radius_mm else "flat"
@@ -55,7 +63,6 @@ def skin(
     first, last = (", ".join(f"{1e3 * metres:.1f}" for metres in at_m) for at_m in corners)
     TERMINAL.print(f"{placed.kind}, in '{placed.frame_id}': from ({first}) to ({last}) mm")
     if drawing is not None:
-        check_place(drawing, file)
         _draw(drawing, placed)
 
 
