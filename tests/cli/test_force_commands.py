@@ -93,6 +93,7 @@ def test_wrong_streams(run: Run, skin: Path) -> None:
         ((GHOST, "--method", "joint", *calibrated), ["either --method or --calibration"]),
         (("emulator://8x8?unit=5", *calibrated), ["of unit 0, the board is unit 5", "force"]),
         (("emulator://4x4", *calibrated, "--force"), ["of a 8x8 skin, the board scans 4x4"]),
+        ((GHOST, "--method", "none", "--tare", "1"), ["leave out --method none"]),
         ((GHOST, "--calibration", "none.json"), ["none.json: cannot be read"]),
     ):
         assert_one_line(run("stream", "--scans", "1", *arguments), *words)

@@ -74,6 +74,8 @@ def stream(
         raise ValueError("say either --method or --calibration: a calibration has its own method")
     if method == "none" and focus:
         raise ValueError("--focus follows what an estimate shows: leave out --method none")
+    if method == "none" and tare_s:
+        raise ValueError("--tare is the rest of an estimate: leave out --method none")
     loaded = None if calibration is None else load_calibration(calibration)
     with ohmskin.open(port) as skin, ExitStack() as stack:
         reader = None
