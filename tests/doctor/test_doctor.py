@@ -379,7 +379,7 @@ def test_order_and_verdict() -> None:
     diagnosis.add(Kind.TOUCHED, moves=True)
     assert diagnosis.worse == []
     diagnosis.add(Kind.LOST, problem="gone")
-    assert verdict(diagnosis) == "not sound: 1 finding, first lost (board)"
+    assert verdict(diagnosis) == "not sound: 1 finding and 1 note, first lost (board)"
     with pytest.raises(ValueError, match="lost has"):
         diagnosis.add(Kind.LOST)
 

@@ -76,6 +76,13 @@ def test_page_and_json(run: Run) -> None:
 
 
 @pytest.mark.usefixtures("benches")
+def test_all_that_is_listed_is_counted(run: Run) -> None:
+    done = run("doctor", "emulator://8x8?open_row=3&scene=single&begin=0")
+    assert "not sound: 1 finding and 1 note, first open row" in done.out
+    assert "2. note, touched" in done.out
+
+
+@pytest.mark.usefixtures("benches")
 def test_what_no_longer_settle_time_has_shown_is_not_known(run: Run) -> None:
     """At 1 Hz, the settle time is as long as any."""
     slow = "emulator://8x8?rate=1"

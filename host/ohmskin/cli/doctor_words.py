@@ -101,10 +101,12 @@ def named(place: Place) -> str:
 
 def verdict(diagnosis: Diagnosis) -> str:
     """One line: whether the skin is sound."""
-    worse = diagnosis.worse
+    worse, notes = diagnosis.worse, len(diagnosis.findings) - len(diagnosis.worse)
     if worse:
         first = f"{worse[0].kind.id.replace('_', ' ')} ({words_of(worse[0])['where']})"
-        return f"not sound: {len(worse)} finding{'s' if len(worse) > 1 else ''}, first {first}"
+        counts = f"{len(worse)} finding{'s' if len(worse) > 1 else ''}"
+        counts += f" and {notes} note{'s' if notes > 1 else ''}" if notes else ""
+        return f"not sound: {counts}, first {first}"
     if any(finding.kind is Kind.TOUCHED for finding in diagnosis.findings):
         return "no fault found, but something touches the skin: let go, and run this again"
     if diagnosis.pressed == []:
