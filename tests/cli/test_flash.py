@@ -146,6 +146,11 @@ UNCLEAR: dict[str, tuple[list[str], list[tuple[str, str]], list[str]]] = {
         [("/dev/ttyACM1", "megaatmega2560")],
         ["/dev/ttyACM1 is a megaatmega2560, not a uno"],
     ),
+    "a Pico, no board": (
+        ["--port", "/dev/ttyACM1"],
+        [("/dev/ttyACM1", "pico")],
+        ["/dev/ttyACM1 is a pico: run 'ohmskin flash pico'"],
+    ),
     "only an unknown bridge": (
         ["uno"],
         [("/dev/ttyUSB0", ""), ("/dev/ttyUSB1", "")],

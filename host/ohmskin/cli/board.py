@@ -257,8 +257,9 @@ def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str
     fitting = [one for one in possible if one.board in ((board,) if board else _BOARDS)]
     if len(fitting) == 1:
         return fitting[0].board, fitting[0].path
-    if port and possible and possible[0].board:
-        raise PortError(f"{port} is a {possible[0].board}, not a {board}: say which you mean")
+    if port and possible and (found := possible[0].board):
+        what = f", not a {board}: say which you mean" if board else f": run 'ohmskin flash {found}'"
+        raise PortError(f"{port} is a {found}{what}")
     if board and port:
         return board, port
     ports = ", ".join(f"{one.path} ({one.board or one.description or '?'})" for one in possible)
