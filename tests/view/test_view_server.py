@@ -7,7 +7,7 @@ import signal
 import socket
 from contextlib import suppress
 from pathlib import Path
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, Mock
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
@@ -229,6 +229,27 @@ def test_a_port_that_is_taken(run: Run) -> None:
         assert_one_line(run("view", "--http-port", port), port, "--http-port")
     assert_one_line(run("view", "--host", "192.0.2.1", "--http-port", "0"), "192.0.2.1")
     assert_one_line(run("view", "--calibration", "/no/such.json"), "/no/such.json")
+
+
+def test_a_host_without_an_address_is_not_tried_at_port_after_port(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = Mock(side_effect=socket.gaierror(-2, "Name or service not known"))
+    monkeypatch.setattr(socket, "create_server", asked)
+    assert_one_line(run("view", "--host", "nosuch.invalid"), "not known", "--host")
+    assert asked.call_count <= 2
+
+
+def test_the_address_of_a_page_that_all_machines_reach_has_a_name() -> None:
+    urls = list[str]()
+
+    def started(url: str) -> None:
+        urls.append(url)
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        server.serve(ViewedBoards(), "", 0, started)
+    assert urls[0].startswith(f"http://{socket.gethostname()}:")
 
 
 def test_without_a_port_the_next_free_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import re
 import secrets
 import socket
 from collections.abc import AsyncIterator, Callable, Collection
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -191,10 +191,16 @@ def _listen(host: str, port: int | None) -> socket.socket:
         except OSError as exc:
             problem = f"{host} port {port} cannot be had: {exc.strerror or exc}"
             remedy = "say another with --http-port; 0 is any that is free"
+            if isinstance(exc, socket.gaierror):
+                remedy = "say another with --host"
             raise OhmskinError(problem, remedy) from exc
     for tried in range(HTTP_PORT, HTTP_PORT + _PORTS_TRIED):
-        with suppress(OSError):
+        try:
             return socket.create_server((host, tried), family=family)
+        except socket.gaierror:
+            break  # a name without an address has none at the next port either
+        except OSError:
+            continue
     return _listen(host, HTTP_PORT)  # raises an error that says why
 
 
@@ -210,7 +216,7 @@ def serve(
     """
     with boards, _listen(host, port) as listening:
         token = secrets.token_urlsafe(16)
-        name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+        name = socket.gethostname() if host in ("", "0.0.0.0", "::") else host
         name = f"[{name}]" if ":" in name else name
         url = f"http://{name}:{listening.getsockname()[1]}/?token={token}"
         app = make_app(boards, host, token, lambda: started(url))
