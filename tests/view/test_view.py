@@ -358,6 +358,21 @@ def test_there_is_a_limit_of_boards(tmp_path: Path) -> None:
         boards.add("/dev/one-too-many")
 
 
+def test_a_board_may_be_closed_while_the_list_of_boards_is_read() -> None:
+    class Leaving:
+        """A board that is closed while somebody asks for its port."""
+
+        @property
+        def port(self) -> str:
+            listed.pop(0, None)
+            return REST
+
+    listed = ViewedBoards()
+    listed.update({0: Leaving(), 1: Leaving()})
+    with pytest.raises(ValueError, match="speed=0"):
+        listed.add(f"{REST}&speed=0")
+
+
 def test_a_skin_in_stepped_time_is_refused() -> None:
     """Stopping its recording waited for ever."""
     with ViewedBoards() as boards, pytest.raises(ValueError, match="leave out speed=0"):

@@ -392,7 +392,7 @@ class ViewedBoards(Closing, dict[int, ViewedBoard]):
 
         :raises ValueError: there are `MOST_BOARDS` already, or time stands still at this port.
         """
-        for number, board in self.items():
+        for number, board in tuple(self.items()):  # another thread may close one
             if board.port == port:
                 return number
         if is_stepped(port):

@@ -91,7 +91,8 @@ class _BoardList:
 
     async def list_boards(self, _: Request) -> Response:
         """Numbers and ports of the boards that are open."""
-        return JSONResponse([{"number": n, "port": b.port} for n, b in self._boards.items()])
+        boards = tuple(self._boards.items())  # another thread may close one
+        return JSONResponse([{"number": number, "port": board.port} for number, board in boards])
 
     async def add_board(self, request: Request) -> Response:
         """Open the board at a port, and say its number."""
