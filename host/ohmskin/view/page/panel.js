@@ -103,8 +103,6 @@ export class Panel {
     this.element.setAttribute("aria-labelledby", title.id);
     this.find(".controls").setAttribute("aria-label", `Controls of ${port}`);
     this.find(".close").setAttribute("aria-label", `Close ${port}`);
-    const values = this.find(".value");
-    values.id = `value-${number}`;
     for (const [name, text] of [
       ["raw", "raw reading"],
       ["estimate", "estimate"],
@@ -414,10 +412,13 @@ export class Panel {
     });
   }
 
+  latency() {
+    return this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–";
+  }
+
   health(scan) {
     const missed = scan.missed ? `${scan.missed} scans missed` : "nothing missed";
-    const late = this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–";
-    const line = `${scan.rate_hz.toFixed(0)} Hz, ${missed}, ${late}`;
+    const line = `${scan.rate_hz.toFixed(0)} Hz, ${missed}, ${this.latency()}`;
     return scan.wires ? `${line} · ${scan.wires}` : line;
   }
 
@@ -432,10 +433,7 @@ export class Panel {
     this.find(".plot").setAttribute("aria-label", `Curve of cell ${this.place()} over ten seconds`);
     say(this.find(".rate"), `${scan.rate_hz.toFixed(1)} Hz`);
     say(this.find(".missed"), `${scan.missed} scans`);
-    say(
-      this.find(".latency"),
-      this.latencies.length ? `${median(this.latencies).toFixed(0)} ms` : "–",
-    );
+    say(this.find(".latency"), this.latency());
     say(this.find(".shown"), `${((1000 * this.drawnAt.length) / DRAWN_MS).toFixed(0)} a second`);
     say(this.find(".takes"), `${(1000 * scan.estimate_s).toFixed(1)} ms`);
     const { chi2 } = scan;
