@@ -10,8 +10,8 @@ what runs                           what Ctrl-C does                            
 anything else                       raises KeyboardInterrupt up to `cli.main.run`   130
 ==================================  ==============================================  ============
 
-In ``stream`` and ``estimate``, which write no file meanwhile, `ends_in_time` ends the process if
-Ctrl-C has not done so in time.
+In ``stream``, ``estimate`` and ``export``, `ends_in_time` ends the process if Ctrl-C has not done
+so in time. Only ``export`` writes a file meanwhile: its partial file may be left then.
 
 Commands of the first two rows go on until somebody ends them, so Ctrl-C is no error there. Commands
 of the second and third row write what they read, and Ctrl-C must not come in the middle of a write.
@@ -88,7 +88,9 @@ def ends_in_time(leave: Callable[[], object]) -> Iterator[None]:
     """End the process, after `leave`, if Ctrl-C has not ended the body within `PATIENCE_S`.
 
     Without this, nothing would be raised until a call of CasADi returns, which may take half a
-    minute. As the process may end anywhere in the body, the body must write nothing.
+    minute. As the process may end anywhere in the body, the body must write nothing, or by
+    `ohmskin.files.whole_file`: it never leaves half a file under the file's own name, and later
+    removes a partial file that was left.
     """
     has_ended, (reads, writes) = threading.Event(), os.pipe()
 

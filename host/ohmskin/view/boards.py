@@ -162,7 +162,7 @@ class ViewedBoard(LiveSkin):
         self, port: str, calibrations: Sequence[Calibration], folder: Path, *, force: bool = False
     ) -> None:
         self.shown: Shown | None = None
-        """The newest scan as it is shown; None while no page shows this board."""
+        """The newest scan as it is shown; None if no page showed this board when it came."""
         self._calibrations, self._folder = calibrations, folder
         self._note = ""  # why there are no forces, although calibrations were given
         self._recording: _Recording | None = None
