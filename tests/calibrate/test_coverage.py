@@ -115,5 +115,5 @@ def test_recordings_of_two_skins_are_not_joined(tmp_path: Path) -> None:
     one = record_kneading(tmp_path / "a.mcap", 2.0, 1)
     with ohmskin.open("emulator://2x2?speed=0") as skin:
         other = Recording([skin.info], [], [], [], [], cut_off=False)
-    with pytest.raises(ValueError, match="several skins"):
+    with pytest.raises(ValueError, match="recorded before: 2x3 cells"):
         joined([one, other])

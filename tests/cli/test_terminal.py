@@ -54,7 +54,9 @@ def test_tables_and_live_pictures_show_text_alone(text: str) -> None:
 
 
 def test_names_of_files_are_text(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")  # with the bar that a terminal shows
+    # With the bar that a wide terminal shows.
+    for name, value in {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "300"}.items():
+        monkeypatch.setenv(name, value)
     whole, cut, out = (tmp_path / name for name in ("a.mcap", "c\x1b[2Jut.mcap", "[red]left.npz"))
     write_recording(whole, stepped(URL).info, map(scan, range(200)))
     cut.write_bytes(whole.read_bytes()[:-200])

@@ -16,6 +16,7 @@ from ohmskin import live
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
+from ohmskin.force.focus import Focus
 from ohmskin.link.device import Device
 from ohmskin.record.recording import Tare, load_recording
 from ohmskin.view import boards
@@ -200,7 +201,7 @@ def test_a_silent_board_whose_contacts_are_followed_is_closed_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answers, waited = threading.Event(), list[bool]()
-    monkeypatch.setattr(boards.Focus, "close", lambda _: waited.append(answers.wait(20)))
+    monkeypatch.setattr(Focus, "close", lambda _: waited.append(answers.wait(20)))
     board = ViewedBoard(REST, [], tmp_path)
     until(lambda: board.opened)
     board.follow(True)
