@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from ohmskin.circuit.skin import Skin, readings
+from ohmskin.estimate.joint import TELLING_SHARE
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
+    PALM_SHARE,
     CellPrior,
     WireStds,
     rest_level,
@@ -80,12 +82,13 @@ def test_fingertips_are_no_palm() -> None:
     row, column = np.indices((8, 8))
     prior = CellPrior(np.full(64, np.log(1e6)), np.full(64, 0.05), np.zeros((64, 3)), np.zeros(3))
 
-    def rises(*middles: tuple[float, float]) -> bool:
+    def share(*middles: tuple[float, float]) -> float:
         tips = (np.exp(-((row - i) ** 2 + (column - j) ** 2) / 2) for i, j in middles)
-        return prior.is_palm(-np.log(1e-6 + 1e-4 * sum(tips)).ravel())
+        return prior.spread_share(-np.log(1e-6 + 1e-4 * sum(tips)).ravel())
 
-    assert not rises((3.5, 3.5))
-    assert not rises((2.0, 2.0), (5.0, 5.0))
+    assert share((3.5, 3.5)) < share((2.0, 2.0), (5.0, 5.0)) < TELLING_SHARE < PALM_SHARE
     middle = np.abs(row - 3.5) + np.abs(column - 3.5) < 5
     assert 0.5 < middle.mean() < 0.7
-    assert prior.is_palm(-np.log(1e-6 + 1e-4 * middle).ravel())
+    of_palm = prior.spread_share(-np.log(1e-6 + 1e-4 * middle).ravel())
+    assert of_palm == pytest.approx(middle.mean(), rel=0.01)
+    assert of_palm > PALM_SHARE

@@ -37,6 +37,7 @@ from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
     LAYER_STD,
     MAX_CHI2,
+    PALM_SHARE,
     REST_STD,
     SEGMENT_STD,
     UNKNOWN_REST_STD,
@@ -90,6 +91,9 @@ SURPRISE_SHARE: Final = 0.1
 # No frame enters the mean with more surprise, and a frame that nothing explains enters it with
 # this. Chosen: more than half of the frames have to be odd before the skin is at fault.
 MOST_SURPRISE: Final = 1.8
+# A frame whose touch is spread over a larger share of the cells does not enter it. Chosen: two of
+# the widest fingertips have 0.38 of 8x8 cells, and palms that no fit finds had 0.42 and more.
+TELLING_SHARE: Final = 0.4
 # Skins of fewer ports have no such mean. Chosen: on 3x3, a few odd readings spoil a whole frame.
 LEAST_STAYING_PORTS: Final = 16
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
@@ -225,8 +229,8 @@ class JointEstimator(Estimator):
         fit_prior = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
         self._belief.expect_usual_leads(prior.is_crowded(start))
         fit = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
-        is_palm = prior.is_palm(fit.log_cells)
-        if is_palm and fit_prior is not prior:
+        spread_share = prior.spread_share(fit.log_cells)
+        if spread_share > PALM_SHARE and fit_prior is not prior:
             # So many cells are not the few hard touches that the narrow prior would prefer. It
             # knows better which cells are at rest.
             fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, fit.log_cells)
@@ -235,7 +239,7 @@ class JointEstimator(Estimator):
         # cells at the edge of a palm would seem to conduct less than at rest.
         message = self._doubt(fit_prior, fit)
         # A palm tells of no fault: that so many cells are pressed is a surprise by itself.
-        tells_of_fault = not (ports.fault or again or is_palm)
+        tells_of_fault = not (ports.fault or again or spread_share > TELLING_SHARE)
         if tells_of_fault and ports.current.size >= LEAST_STAYING_PORTS:
             surprise = MOST_SURPRISE if message else min(fit.surprise, MOST_SURPRISE)
             self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
