@@ -53,14 +53,13 @@ def test_tables_and_live_pictures_show_text_alone(text: str) -> None:
     assert "\x1b[2J" not in file.getvalue()
 
 
-def test_names_of_files_are_text(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    # With the bar that a wide terminal shows.
-    for name, value in {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "300"}.items():
-        monkeypatch.setenv(name, value)
+def test_names_of_files_are_text(tmp_path: Path) -> None:
     whole, cut, out = (tmp_path / name for name in ("a.mcap", "c\x1b[2Jut.mcap", "[red]left.npz"))
     write_recording(whole, stepped(URL).info, map(scan, range(200)))
     cut.write_bytes(whole.read_bytes()[:-200])
-    said = run("export", str(cut), str(out)).err
+    # With the bar that a wide terminal shows: a program looks at these when it starts.
+    shows = {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "300"}
+    said = python("-m", "ohmskin", "export", cut, out, **shows).err
     assert f"{tmp_path}/c?[2Jut.mcap was cut off" in said
     assert "[red]left.npz" in said
     assert "\x1b[2J" not in said
