@@ -10,9 +10,9 @@ import pytest
 
 from network import SkinCircuit
 from ohmskin.arrays import Float
-from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.estimate.port_partial import STALE_SHARE
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.record.readings import estimate_file, load_readings
@@ -244,53 +244,58 @@ def test_two_readings_of_a_cell_are_worth_the_mean_of_two() -> None:
     assert found.std(axis=0).mean() < 1.3 * np.mean([ports.current_std for ports in read])
 
 
-def touched_in_a_region(siemens: float) -> tuple[list[Estimate], Float]:
-    """By `joint`: frames of the region alone, of a touch that came after the whole frame at rest,
-    and the same frame read as a whole; the true cells.
-    """
+def read_with(siemens: float, row: int, column: int) -> tuple[SkinKnowledge, Float]:
+    """What is known of a skin, and a frame of it with this cell [S] and all others at rest."""
     made, rest, _ = trial("touches")
     cells = made.rest.cell_siemens.copy()
-    cells[3, 5] = siemens
-    frame = ratio_from_codes(quantise(SkinCircuit(made.rest).readings(cells)[..., :4]))
-    at_rest = SkinCircuit(made.rest).readings(made.rest.cell_siemens)[..., :4]
-    estimator = make_estimator("joint", knowledge(rest))
-    estimator.estimate(ratio_from_codes(quantise(at_rest)))
-    part = of_region(frame, slice(2, 5), slice(4, 7), READ["near"])
-    found = [estimator.estimate(part) for _ in range(3)]
-    return [*found, make_estimator("joint", knowledge(rest)).estimate(frame)], cells
+    cells[row, column] = siemens
+    return knowledge(rest), ratio_from_codes(
+        quantise(SkinCircuit(made.rest).readings(cells)[..., :4])
+    )
 
 
 @pytest.mark.parametrize("siemens", [5e-5, 2e-4, 6e-4])
 def test_a_touch_that_arrives_in_a_region_is_as_uncertain_as_in_a_whole_frame(
     siemens: float,
 ) -> None:
-    (*parts, whole), cells = touched_in_a_region(siemens)
-    for part in parts:
+    (known, frame), (_, at_rest) = read_with(siemens, 3, 5), read_with(1e-6, 3, 5)
+    whole = make_estimator("joint", known).estimate(frame)
+    estimator = make_estimator("joint", known)
+    estimator.estimate(at_rest)
+    for _ in range(3):
+        part = estimator.estimate(of_region(frame, slice(2, 5), slice(4, 7), READ["near"]))
         assert part.converged, part.message
-        assert part.cell_siemens[3, 5] == pytest.approx(cells[3, 5], rel=0.2)
-        stated = part.cell_siemens_std[3, 5] / whole.cell_siemens_std[3, 5]
-        assert 0.7 < stated < 1.5
+        assert part.cell_siemens[3, 5] == pytest.approx(siemens, rel=0.2)
+        assert 0.7 < part.cell_siemens_std[3, 5] / whole.cell_siemens_std[3, 5] < 1.5
+
+
+@pytest.mark.parametrize("touches", [(2e-5, 2e-5), (2e-5, 1e-4)], ids=["still", "changing"])
+def test_cells_outside_a_region_age_however_touches_in_it_change(
+    touches: tuple[float, float],
+) -> None:
+    """By a share a frame, as ports do that are not read."""
+    frames = [read_with(siemens, 3, 5)[1] for siemens in touches]
+    estimator = make_estimator("joint", read_with(touches[0], 3, 5)[0])
+    estimator.estimate(frames[0])
+    for number in range(12):
+        part = of_region(frames[number % 2], slice(2, 5), slice(4, 7), READ["near"])
+        found = estimator.estimate(part)
+    outside = (found.cell_siemens_std / found.cell_siemens)[6:, :3]
+    assert (outside > 0.9 * 12 * STALE_SHARE).all()
 
 
 def test_what_a_whole_frame_cannot_be_relied_on_for_no_region_is() -> None:
     """A cell that conducts more than any touch, then frames of another region."""
-    made, rest, _ = trial("touches")
-    cells = made.rest.cell_siemens.copy()
-    cells[5, 5] = 1 / 20
-    frame = ratio_from_codes(quantise(SkinCircuit(made.rest).readings(cells)[..., :4]))
-    estimator = make_estimator("joint", knowledge(rest))
-    whole = estimator.estimate(frame)
-    assert not whole.converged
+    known, frame = read_with(1 / 20, 5, 5)
+    estimator = make_estimator("joint", known)
+    assert not estimator.estimate(frame).converged
     part = estimator.estimate(of_region(frame, slice(0, 3), slice(0, 3), READ["near"]))
     assert not part.converged
 
 
 def test_cells_outside_a_region_keep_all_of_their_uncertainty() -> None:
-    made, rest, _ = trial("touches")
-    cells = made.rest.cell_siemens.copy()
-    cells[6, 6] = 1 / 1500
-    frame = ratio_from_codes(quantise(SkinCircuit(made.rest).readings(cells)[..., :4]))
-    estimator = make_estimator("joint", knowledge(rest))
+    known, frame = read_with(1 / 1500, 6, 6)
+    estimator = make_estimator("joint", known)
     whole = estimator.estimate(frame)
     part = estimator.estimate(of_region(frame, slice(0, 3), slice(0, 3), READ["near"]))
     assert part.cell_siemens_std[6, 6] >= whole.cell_siemens_std[6, 6]

@@ -410,9 +410,8 @@ def _damped(step: Float, before: Float) -> Float:
 
     Along the step before, this step is r times as long (`turned`). If steps change linearly from
     place to place, there is a place where they are 0: after the share 1 / (1 - r) of this step, if
-    the step before was taken whole.
-    Where wires and cells can explain the same readings, whole steps would go back and forth for
-    ever, with r about -1.
+    the step before was taken whole. Where wires and cells can explain the same readings, whole
+    steps would go back and forth for ever, with r about -1.
     """
     square = before @ before
     turned = float(step @ before) / max(float(square), 1e-12)

@@ -284,7 +284,7 @@ class JointEstimator(Estimator):
             return None
         if self._region.has_left():
             self._whole = self._as_whole(prior, self._region)
-            self._region = RegionFit(self._whole, ports.region)
+            self._region = RegionFit(self._whole, ports.region, self._region.age)
             if not self._region.fit(ports):
                 return None
         return self._region

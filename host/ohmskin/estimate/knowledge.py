@@ -70,7 +70,7 @@ class WireOhm(NamedTuple):
         return self.lead, self.lead_std_ohm or LEAD_STD * self.lead
 
     def or_surer(self, found: "WireOhm") -> "WireOhm":
-        """These wires; the layers of `found`, or its lead, where it knows them much more surely.
+        """These wires, but with the layers or the lead of `found` where it knows them more surely.
 
         A method expects that layers have changed by `LAYER_STD` since they were told. So what it
         has found counts only where its deviations are below half of those that were told, or of

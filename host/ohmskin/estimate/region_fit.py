@@ -15,17 +15,18 @@ A whole frame takes milliseconds, and a frame of a region about a tenth of that:
 read a thousand times a second.
 """
 
-from typing import Final, Protocol
+from typing import Final, TypeAlias
 
 import numpy as np
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.small import cholesky, gram, solve_lower, solve_positive
+from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.port_partial import STALE_SHARE
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import LEFT_OUT_STDS, MAX_CHI2, MAX_STEP_LOG, CellPrior
-from ohmskin.estimate.sparse_fit import Cells, RestNetwork
+from ohmskin.estimate.sparse_fit import Cells, RestNetwork, Touched
 from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, WireBelief
 
 # Most steps of a frame; one that needs more is fitted as a whole. Chosen: a frame begins at the
@@ -33,44 +34,18 @@ from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, WireBelief
 MOST_STEPS: Final = 9
 
 
-class Answer(Protocol):
-    """What is known of the cells after a frame: a `FullFit`, a `Touched` or a `RegionFit`."""
-
-    @property
-    def log_cells(self) -> Float:
-        """Log resistances of all cells, (RC,)."""
-
-    @property
-    def log_cells_std(self) -> Float:
-        """Their deviations, (RC,)."""
-
-    @property
-    def wires_log_std(self) -> Float:
-        """The parts of these that come from the means of the layers, (RC,)."""
-
-    @property
-    def leads_log_std(self) -> Float:
-        """The parts that come from the mean lead, (RC,)."""
-
-    @property
-    def misfit(self) -> float:
-        """Chi-square per port."""
-
-    @property
-    def surprise(self) -> float:
-        """Chi-square over what the model expects of it."""
-
-
 class WholeFrame:
     """What has been shown so far, for regions of the frames that come: g0 and its deviations."""
 
     def __init__(
-        self, prior: CellPrior, belief: WireBelief, ref_ohm: float, answer: Answer
+        self, prior: CellPrior, belief: WireBelief, ref_ohm: float, answer: "Answer"
     ) -> None:
         about = prior.about(belief.means)
         is_soft = about.is_soft(answer.log_cells, belief.shape)
         self.prior, self.belief = about.for_soft_touches() if is_soft else about, belief
         self.log_cells, self.log_cells_std = answer.log_cells, answer.log_cells_std
+        if isinstance(answer, RegionFit):
+            self.log_cells_std = answer.fitted_std
         self.wires_log_std, self.leads_log_std = answer.wires_log_std, answer.leads_log_std
         self.misfit, self.surprise = answer.misfit, answer.surprise
         self.series_ohm = ref_ohm + belief.lead_count * belief.means[2]
@@ -89,9 +64,19 @@ class RegionFit:
     modelled: port currents of the model, (RC,) [S]; outside of the region, those that are kept.
     iterations: steps of the last frame.
     misfit, surprise: of the whole frame, because a frame that does not fit gets no answer here.
+    age: for how many frames the cells outside have not been read.
+    fitted_std: log_cells_std without what cells outside may have changed by since, (RC,).
     """
 
-    def __init__(self, whole: WholeFrame, region: Cells) -> None:
+    log_cells: Float
+    log_cells_std: Float
+    wires_log_std: Float
+    leads_log_std: Float
+    fitted_std: Float
+    misfit: float
+    surprise: float
+
+    def __init__(self, whole: WholeFrame, region: Cells, age: int = 0) -> None:
         self.region, self._whole, net, belief = region, whole, whole.net, whole.belief
         self.misfit, self.surprise = whole.misfit, whole.surprise
         self._x = -whole.log_cells[region]
@@ -112,7 +97,7 @@ class RegionFit:
         self._by_wires = belief.per_std(by_wire, square * belief.leads_of_ports[region], of_cells)
         # S, but for the readings.
         self._model_covariance = gram(np.hstack([self._by_wires, by_cell * whole.log_cells_std]))
-        self._age = 0
+        self.age = age
 
     def fit(self, ports: PortReadings) -> bool:
         """Fit this frame. Returns whether the fit explains it.
@@ -163,12 +148,14 @@ class RegionFit:
     def _answer(self, covariance: Float, by_means: Float) -> None:
         """Logs of all cells, from the covariance of those of the region, (k, k) and (k, means)."""
         whole, region = self._whole, self.region
-        self._age += 1
+        self.age += 1
         self.log_cells = whole.log_cells.copy()
         self.log_cells[region] = -self._x
+        self.fitted_std = whole.log_cells_std.copy()
+        self.fitted_std[region] = np.sqrt(covariance.diagonal())
         # A cell outside changes by the same share as the current of a port that is not read.
-        self.log_cells_std = np.hypot(whole.log_cells_std, STALE_SHARE * self._age)
-        self.log_cells_std[region] = np.sqrt(covariance.diagonal())
+        self.log_cells_std = np.hypot(self.fitted_std, STALE_SHARE * self.age)
+        self.log_cells_std[region] = self.fitted_std[region]
         self.wires_log_std = whole.wires_log_std.copy()
         self.leads_log_std = whole.leads_log_std.copy()
         self.wires_log_std[region] = np.hypot(by_means[:, 0], by_means[:, 1])
@@ -178,3 +165,7 @@ class RegionFit:
         """Whether the fitted cells have moved too far from g0 for S."""
         moved = self.log_cells[self.region] - self._whole.log_cells[self.region]
         return bool(np.abs(moved).max() > LARGE_MOVE_LOG)
+
+
+# What is known of the cells after a frame.
+Answer: TypeAlias = FullFit | Touched | RegionFit
