@@ -31,7 +31,7 @@ def test_the_stand_in_normal_has_the_slope_of_the_prior() -> None:
 def test_deviations_of_conductances_are_those_of_logs_where_both_are_small() -> None:
     log_siemens, log_std = np.log([1e-6, 1e-5, 1e-4]), np.full(3, 0.001)
     up, down = siemens_std(
-        log_siemens, log_std, np.zeros(3), np.zeros(3), WireStds(0.1, 1.0), np.full(3, 6e4)
+        log_siemens, log_std, np.zeros(3), np.zeros(3), WireStds(0.1, 1.0, 1.0), np.full(3, 6e4)
     )
     np.testing.assert_allclose(up, 0.001 * np.exp(log_siemens), rtol=0.03)
     np.testing.assert_allclose(down, 0.001 * np.exp(log_siemens), rtol=0.03)
@@ -40,7 +40,9 @@ def test_deviations_of_conductances_are_those_of_logs_where_both_are_small() -> 
 def test_a_cell_behind_unknown_wires_may_be_a_short() -> None:
     """1 kOhm +- 50 % behind 10 kOhm of wire: two deviations down are nearly nothing."""
     half, series_ohm = np.array([0.5]), np.array([7e4])
-    up, down = siemens_std(np.log([1e-3]), half, half, np.zeros(1), WireStds(0.05, 1.0), series_ohm)
+    up, down = siemens_std(
+        np.log([1e-3]), half, half, np.zeros(1), WireStds(0.05, 1.0, 1.0), series_ohm
+    )
     assert 1e-3 + 2 * up[0] == pytest.approx(HIGHEST_TOUCH_SIEMENS)
     assert 0 < down[0] < 0.5e-3
 
@@ -48,19 +50,24 @@ def test_a_cell_behind_unknown_wires_may_be_a_short() -> None:
 def test_wires_of_unknown_length_make_a_cell_uncertain_upwards() -> None:
     """A layer known to a factor of two: two of its deviations up are a factor of four."""
     part, none, series_ohm = np.array([0.01]), np.zeros(1), np.array([6e4])
-    wires = WireStds(np.log(2.0), 1.0)
+    wires = WireStds(np.log(2.0), 1.0, 1.0)
     up, down = siemens_std(np.log([1e-5]), part, part, none, wires, series_ohm)
     assert up[0] == pytest.approx(1e-5 * 0.01 * 3 / np.log(4.0), rel=0.02)
     assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)
     # Three of its deviations, where nobody told it, are a factor of eight.
     up, _ = siemens_std(np.log([1e-5]), part, part, none, wires._replace(reach_stds=3), series_ohm)
     assert up[0] == pytest.approx(1e-5 * 0.01 * 7 / np.log(8.0), rel=0.05)
+    # A layer that may just have grown longer, by five times the deviation that the fit took.
+    wires = WireStds(np.log(2.0), 5.0, 1.0)
+    up, down = siemens_std(np.log([1e-5]), part, part, none, wires, series_ohm)
+    assert up[0] == pytest.approx(1e-5 * 0.05 * 3 / np.log(4.0), rel=0.2)
+    assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)
 
 
 def test_leads_that_may_be_unusual_make_a_cell_uncertain_upwards() -> None:
     """Ten times as unsure as the fit took them: all of the deviation comes from leads here."""
     part, none, series_ohm = np.array([0.01]), np.zeros(1), np.array([6e4])
-    wires = WireStds(0.1, 10.0)
+    wires = WireStds(0.1, 1.0, 10.0)
     up, down = siemens_std(np.log([1e-5]), part, none, part, wires, series_ohm)
     assert up[0] == pytest.approx(1e-5 * 0.1, rel=0.2)
     assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)

@@ -15,12 +15,13 @@ from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.prior import (
-    AGILE_FADE,
-    AGILE_SHARE,
+    CHANGED_ODDS,
     LAYER_STD,
     MEMORY,
     SEGMENT_STD,
     STEADY_FADE,
+    UNKNOWN_LAYER_STD,
+    WARY_ODDS,
 )
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
 from ohmskin.estimate.wire_belief import LearnedWires, Lesson
@@ -209,7 +210,10 @@ def test_a_finger_over_several_cells_is_followed(method: str, seed: int, known: 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])
 def test_a_jump_of_the_wires_is_followed(method: str) -> None:
-    """Eight simulated skins, 40 frames each before and after all wires double."""
+    """Eight simulated skins, 40 touches each before and after all wires double.
+
+    Five touches are too few to show that, at most: after them, deviations say what is not known.
+    """
     away, errors = [], []
     for seed in range(8):
         random = np.random.default_rng(100 + seed)
@@ -222,9 +226,9 @@ def test_a_jump_of_the_wires_is_followed(method: str) -> None:
         trial = trial_of(rest, frames)
         out = estimate_file(trial.rounded(10), method)
         error = np.abs(out["cell_siemens"] - trial.cell_siemens)
-        late = np.s_[60:], trial.pressed[60:]
-        away += (error / out["cell_siemens_std"])[late[0]][late[1]].tolist()
-        errors += (error / trial.cell_siemens)[late[0]][late[1]].tolist()
+        stds, pressed = error / out["cell_siemens_std"], trial.pressed
+        away += stds[45:][pressed[45:]].tolist()
+        errors += (error / trial.cell_siemens)[60:][pressed[60:]].tolist()
     assert np.mean(np.array(away) < 4) > 0.95
     assert np.median(errors) < 0.04
 
@@ -302,39 +306,62 @@ def test_wires_far_from_what_is_expected_are_learned(method: str) -> None:
         assert estimator.wires().both == pytest.approx((1000.0, 1000.0), rel=0.2)
 
 
-def test_the_belief_of_wires_is_of_two_kalman_filters() -> None:
-    """Against the textbook's covariance form and likelihood: two lessons, each after a fade."""
+def learned(by_mean: Float, noise: Float, at: Float, faded: Float) -> tuple[float, Float, Float]:
+    """Likelihood of a residual, what the mean gains, and its covariance after it (Kalman)."""
+    expected = by_mean @ faded @ by_mean.T + noise
+    likelihood = scipy.stats.multivariate_normal(np.zeros(len(at)), expected).pdf(at)
+    gain = faded @ by_mean.T @ np.linalg.inv(expected)
+    return float(likelihood), gain @ at, faded - gain @ by_mean @ faded
+
+
+def mixture(weights: Float, means: Float, covariances: Float) -> tuple[Float, Float]:
+    """Mean and covariance of two, (2, n) and (2, n, n)."""
+    shares = weights / weights.sum()
+    mean = shares @ means
+    apart = means - mean
+    spread = np.einsum("i,ij,ik->jk", shares, apart, apart)
+    return mean, np.tensordot(shares, covariances, 1) + spread
+
+
+def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one() -> None:
+    """Against the textbook's covariance form and likelihood: three lessons."""
     random = np.random.default_rng(8)
     belief = LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0, lead_std_ohm=20.0))
     layers = scipy.linalg.block_diag(*(np.ones((n, 1)) for n in (6, 6, 5)))
     prior = np.diag([LAYER_STD, LAYER_STD, 20.0]) ** 2
-    mean = before = np.array([np.log(100.0), np.log(200.0), 50.0])
-    means, covariances, scores = [mean, mean], [prior, prior], [0.0, 0.0]
-    covariance, scale = prior, np.repeat([1.0, 1.0, 0.01], (6, 6, 5))
-    for _ in range(2):
+    before = mean = steady_mean = wary_mean = np.array([np.log(100.0), np.log(200.0), 50.0])
+    covariance = steady = wary = prior
+    scores, scale = np.zeros(2), np.repeat([1.0, 1.0, 0.01], (6, 6, 5))
+    for _ in range(3):
         own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * mean[2]], (6, 6, 5))) ** 2
         slopes, at_mean = scale * random.normal(size=(4, 17)), random.normal(size=4)
         noise = slopes @ own @ slopes.T + np.diag(random.uniform(1, 2, 4))
         by_mean = slopes @ layers
         factor = np.linalg.cholesky(by_mean @ covariance @ by_mean.T + noise)
         belief.take(Lesson(belief.per_mean_std(by_mean), at_mean, factor))
-        for which, fade in enumerate((STEADY_FADE, AGILE_FADE)):
-            residual = at_mean - by_mean @ (means[which] - mean)
-            widest = np.diag(np.maximum(np.diag(covariances[which]), [LAYER_STD**2] * 2 + [0.0]))
-            faded = (1 - fade) * covariances[which] + fade * widest
-            expected = by_mean @ faded @ by_mean.T + noise
-            likelihood = scipy.stats.multivariate_normal(np.zeros(4), expected).logpdf(residual)
-            gain = faded @ by_mean.T @ np.linalg.inv(expected)
-            means[which] = means[which] + gain @ residual
-            covariances[which] = faded - gain @ by_mean @ faded
-            scores[which] = MEMORY * scores[which] + likelihood
-        shares = np.exp(scores) * (1 - AGILE_SHARE, AGILE_SHARE)
-        shares /= shares.sum()
-        mean = shares @ means
-        covariance = sum(
-            share * (own_covariance + np.outer(one - mean, one - mean))
-            for share, own_covariance, one in zip(shares, covariances, means, strict=True)
+
+        drifted = np.diag(np.maximum(np.diag(steady), [LAYER_STD**2] * 2 + [0.0]))
+        faded = steady + STEADY_FADE * (drifted - steady)
+        residual = at_mean - by_mean @ (steady_mean - mean)
+        of_steady, moved, steady = learned(by_mean, noise, residual, faded)
+        steady_mean = steady_mean + moved
+
+        changed = np.diag([*[UNKNOWN_LAYER_STD**2] * 2, wary[2, 2]])
+        residual = at_mean - by_mean @ (wary_mean - mean)
+        both = [learned(by_mean, noise, residual, faded) for faded in (wary, changed)]
+        likelihoods, moves, covariances = (np.array(each) for each in zip(*both, strict=True))
+        of_both = np.array([1, CHANGED_ODDS]) / (1 + CHANGED_ODDS) * likelihoods
+        wary_mean, wary = mixture(of_both, wary_mean + moves, covariances)
+
+        scores = MEMORY * scores + np.log([of_steady, of_both.sum()])
+        weights = np.array([1, WARY_ODDS]) * np.exp(scores)
+        mean, covariance = mixture(
+            weights, np.array([steady_mean, wary_mean]), np.array([steady, wary])
         )
+    wary_std = np.hypot(np.sqrt(np.diag(wary)), wary_mean - mean)[:2]
+    layer_std = np.sqrt(np.diag(covariance))[:2]
+    assert belief.stds().layer_std == pytest.approx(max(wary_std))
+    assert belief.stds().layer_std_ratio == pytest.approx(max(wary_std / layer_std))
     np.testing.assert_allclose(belief.expected_wires, layers @ mean, rtol=1e-9)
     own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * mean[2]], (6, 6, 5))) ** 2
     whole = layers @ covariance @ layers.T + own

@@ -64,14 +64,14 @@ UNKNOWN_LEAD_STD_OHM: Final = 2000.0
 USUAL_LEAD_STD_OHM: Final = 150.0
 # Deviation that all leads share, if they are told, as a share of them.
 LEAD_STD: Final = 0.05
-# Share of what is known of the layers that fades before each lesson, because skins bend: the first
-# for a skin that lies still, the second for a skin that has just been bent.
-STEADY_FADE: Final = 0.01
-AGILE_FADE: Final = 0.6
-# Probability, before any lesson, that the skin has just been bent.
-AGILE_SHARE: Final = 0.5
-# Lessons tell which of the two fades fits better, by a score for each. At each further lesson, this
-# share of a score is kept.
+# Share of what is known of the layers that fades from one touch to the next, because wires drift.
+STEADY_FADE: Final = 0.003
+# Odds that the wires have changed altogether from one touch to the next, because skins bend.
+CHANGED_ODDS: Final = 0.04
+# Odds, before any touch, that wires change as suddenly as that, and do not only drift.
+WARY_ODDS: Final = 2.0
+# Touches tell which of the two fits better, by a score for each. At each further touch, this share
+# of a score is kept.
 MEMORY: Final = 0.8
 
 # A fit gives up after so many steps, so that the time of a frame is bounded.
@@ -200,12 +200,15 @@ class WireStds(NamedTuple):
     """How well the means of a skin's wires are known.
 
     layer_std: standard deviation of the log of the mean segment, of the layer that is known less.
+        It minds that wires may just have changed.
+    layer_std_ratio: the same over the one that fits take.
     lead_std_ratio: deviation of the mean lead as known, over the one that fits take (under
         fingertips, fits expect usual leads).
     reach_stds: how many deviations away the upper limit is.
     """
 
     layer_std: float
+    layer_std_ratio: float
     lead_std_ratio: float
     reach_stds: float = REACH_STDS
 
@@ -237,12 +240,14 @@ def siemens_std(
     cell_ohm = 1.0 / siemens
     # The cell conducts most if its wires resist most. Wires are normal in their log. So at the
     # upper limit they are exp(k layer_std) - 1 above their mean, where the first order has
-    # k layer_std. The part of the deviation that comes from wires grows by this ratio. At the lower
+    # k layer_std. The part of the deviation that comes from wires grows by this ratio. It grows by
+    # one more, because wires may just have grown longer, which fits do not expect. At the lower
     # limit, wires are off by less than k layer_std, so there the first order is enough.
     # The mean lead may be larger than the fit expects, which widens the deviation upwards alone: a
     # lead cannot be as much smaller, because none is below 0.
     reach = wires.reach_stds
-    wider = np.expm1(reach * wires.layer_std) / (reach * wires.layer_std)
+    reach_log = reach * wires.layer_std
+    wider = np.expm1(reach_log) / reach_log * wires.layer_std_ratio
     more = (wider**2 - 1.0) * wires_log_std**2 + (wires.lead_std_ratio**2 - 1.0) * leads_log_std**2
     up_std = np.sqrt(log_std**2 + more)
     # d log I = - r / (r + series) d log r. So at the limits the current is (1 +- off) I, and the

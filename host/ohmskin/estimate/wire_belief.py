@@ -53,22 +53,28 @@ A single touch reveals nothing of the wires, because its own resistance is in th
 holds the touched cells as noise without limit. What single wires differ from their means by is not
 learned: frames of near ends say too little of it.
 
-A skin bends. So before a lesson, V grows by a share f towards the covariance of layers that are
-only told; that of the leads stays. For a skin that is still, which most are, a small f gives the
-best means; for one that was just bent, a large f does. So there are two filters, steady and agile,
-each with its own f, m and V. The score of a filter says how well it has expected a lesson: it is
-the log likelihood, without what is the same for both.
+A skin bends. So there are two filters. The steady one is for a skin that lies still, as most do:
+before a lesson, a small share of what it knows of the layers fades, so that it follows a slow
+drift. The wary one takes each lesson twice: for wires that are what they were, and, with the odds
+`CHANGED_ODDS`, for wires that have changed since the last lesson, so that no more is known of the
+layers than if nobody had told them. It goes on with the mixture of both, by its mean and its
+covariance. (Such a filter is called generalized pseudo-Bayesian, of first order: Bar-Shalom, Li,
+Kirubarajan, *Estimation with Applications to Tracking and Navigation*, chapter 11.)
 
-With m_0 the mean that the fit had, d = m - m_0, g_0 = L J^T N^-1 z at m_0, g = g_0 - A d, V before
-and V' after the lesson,
+The odds of a mixture are those before the lesson, times the exponential of a difference of scores.
+A score says how well the lesson was expected: it is the log likelihood, without what is the same
+for all. With m_0 the mean that the fit had, d = m - m_0, g_0 = L J^T N^-1 z at m_0, g = g_0 - A d,
+V before and V' after the lesson,
 
     score = d . g_0 - d . A d / 2 + (g . V' g - log det(1 + V A)) / 2 .
 
-What is believed is the mixture of both filters, by its mean and its covariance. The odds of the
-agile one are those before any lesson, times the exponential of the difference of both sums of
-scores. At each lesson, a sum keeps the share `MEMORY` of what it was. (This is a multiple-model
-filter: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
-chapter 11.)
+What is believed is the mixture of both filters, with the odds `WARY_ODDS` of the wary one before
+any lesson. A filter adds up its scores, and at each lesson the sum keeps the share `MEMORY` of what
+it was.
+
+Most lessons say too little to show a change. A fit takes what is believed, which has the least
+error on a skin that lies still. But the upper deviations of its answer are those of the wary
+filter: if wires have just grown longer, cells conduct more than they seem to.
 """
 
 from abc import ABC, abstractmethod
@@ -83,8 +89,7 @@ from ohmskin.circuit.small import solve, solve_lower
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    AGILE_FADE,
-    AGILE_SHARE,
+    CHANGED_ODDS,
     LAYER_STD,
     MAX_STEP_LOG,
     MEMORY,
@@ -96,6 +101,7 @@ from ohmskin.estimate.prior import (
     UNKNOWN_WIRE_OHM,
     UNTOLD_REACH_STDS,
     USUAL_LEAD_STD_OHM,
+    WARY_ODDS,
     WireStds,
 )
 
@@ -189,7 +195,7 @@ class WireBelief(ABC):
         wires: what is known of them.
         may_be_bent: whether the skin may have been bent since they were measured.
         """
-        self.shape, self.far = shape, far
+        self.shape, self.far, self._may_be_bent = shape, far, may_be_bent
         rows, columns = shape
         self._counts = rows * columns, rows * columns, rows + columns  # wires of each mean
         by_row = np.kron(np.eye(rows), np.ones((columns, 1))) * (not far[0])
@@ -349,9 +355,18 @@ class WireBelief(ABC):
 
     def stds(self) -> WireStds:
         """How well the means are known."""
-        *layers, lead_std_ohm = self.means_std()[:3].tolist()
-        reach = UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS
-        return WireStds(max(layers), self._known_lead_std_ohm / lead_std_ohm, reach)
+        layer_stds, lead_std_ohm = self.means_std()[:2], float(self.means_std()[2])
+        wary_stds = np.maximum(self._wary_layer_stds(), layer_stds)
+        return WireStds(
+            float(wary_stds.max()),
+            float((wary_stds / layer_stds).max()),
+            self._known_lead_std_ohm / lead_std_ohm,
+            UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS,
+        )
+
+    def _wary_layer_stds(self) -> Float:
+        """Deviations of both layers (2,), for wires that may have changed since the last frame."""
+        return self.means_std()[:2]
 
     @property
     def _known_lead_std_ohm(self) -> float:
@@ -423,11 +438,38 @@ class WireBelief(ABC):
 
 
 class _Filter(NamedTuple):
-    """One of the two filters: m and V; score: the sum of how well it has expected the lessons."""
+    """A filter: m and V; score: the sum of how well it has expected the lessons."""
 
     means: Float
     covariance: Float
     score: float = 0.0
+
+    def stepped(
+        self, expected: Float, covariance: Float, information: Float, pull: Float
+    ) -> "_Filter":
+        """This filter after a lesson.
+
+        expected: m_0, (n,). covariance: V before the lesson, (n, n). information: A, (n, n).
+        pull: g_0 at `expected`, (n,).
+        """
+        after = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + information), np.float64)
+        off = self.means - expected
+        here = pull - information @ off
+        score = off @ pull - 0.5 * off @ information @ off + 0.5 * here @ after @ here
+        score -= 0.5 * np.linalg.slogdet(np.eye(len(off)) + covariance @ information)[1]
+        means: Float = np.asarray(self.means + after @ here, np.float64)
+        return _Filter(means, after, MEMORY * self.score + float(score))
+
+
+def _mixture(one: _Filter, other: _Filter, odds: float) -> _Filter:
+    """Mean and covariance of both. odds: of the other to the one, before their scores."""
+    scored_odds = odds * np.exp(min(other.score - one.score, 50.0))
+    share = scored_odds / (1 + scored_odds)
+    apart = other.means - one.means
+    covariance = (1 - share) * one.covariance + share * other.covariance
+    covariance += share * (1 - share) * np.outer(apart, apart)
+    score = one.score + np.log1p(scored_odds) - np.log1p(odds)
+    return _Filter(one.means + share * apart, covariance, float(score))
 
 
 class LearnedWires(WireBelief):
@@ -483,31 +525,38 @@ class LearnedWires(WireBelief):
         per_log = np.linalg.inv(self._root)
         weights = per_log.T @ np.linalg.inv(np.eye(len(gain)) - gain @ per_mean_std) @ gain
         information, pull = weights @ per_mean_std @ per_log, weights @ residual
-        fades = STEADY_FADE, AGILE_FADE
+        steady, wary = self._before_lesson
         self._filters = [
-            self._stepped(before, fade, information, pull)
-            for before, fade in zip(self._before_lesson, fades, strict=True)
+            steady.stepped(self.means, self._faded(steady), information, pull),
+            _mixture(
+                wary.stepped(self.means, wary.covariance, information, pull),
+                wary.stepped(self.means, self._changed(wary), information, pull),
+                CHANGED_ODDS,
+            ),
         ]
-        steady, agile = self._filters
-        agile_odds = AGILE_SHARE / (1 - AGILE_SHARE) * np.exp(min(agile.score - steady.score, 50.0))
-        share = agile_odds / (1 + agile_odds)
-        apart = agile.means - steady.means
-        covariance = (1 - share) * steady.covariance + share * agile.covariance
-        covariance += share * (1 - share) * np.outer(apart, apart)
-        self._believe(steady.means + share * apart, covariance)
+        believed = _mixture(self._filters[0], self._filters[1], WARY_ODDS)
+        self._believe(believed.means, believed.covariance)
 
-    def _stepped(self, before: _Filter, fade: float, information: Float, pull: Float) -> _Filter:
-        """One filter after a lesson. information: A, (n, n). pull: g_0 at `self.means`, (n,)."""
-        # A bend changes layers by no more than told ones may be off, and no leads. Nor does it
-        # change leaks, but a damp skin dries: their covariance may grow to what it was at first.
-        bent = np.diagonal(self._prior_covariance).copy()
-        bent[:3] = np.minimum(bent[:3], [LAYER_STD**2, LAYER_STD**2, 0.0])
-        widest = np.diag(np.maximum(np.diagonal(before.covariance), bent))
-        faded = before.covariance + fade * (widest - before.covariance)
-        covariance = np.asarray(np.linalg.inv(np.linalg.inv(faded) + information), np.float64)
-        off = before.means - self.means
-        here = pull - information @ off
-        score = off @ pull - 0.5 * off @ information @ off + 0.5 * here @ covariance @ here
-        score -= 0.5 * np.linalg.slogdet(np.eye(len(off)) + faded @ information)[1]
-        means: Float = np.asarray(before.means + covariance @ here, np.float64)
-        return _Filter(means, covariance, MEMORY * before.score + float(score))
+    def _faded(self, before: _Filter) -> Float:
+        """V of a filter before a lesson, (n, n), if wires may have drifted since the last one."""
+        told = np.minimum(np.diagonal(self._prior_covariance)[:2], LAYER_STD**2)
+        return before.covariance + STEADY_FADE * (self._widened(before, told) - before.covariance)
+
+    def _changed(self, before: _Filter) -> Float:
+        """The same, if they have changed altogether."""
+        if self._may_be_bent:
+            return self._widened(before, np.full(2, UNKNOWN_LAYER_STD**2))
+        return self._widened(before, np.diagonal(self._prior_covariance)[:2])
+
+    def _widened(self, before: _Filter, layers: Float) -> Float:
+        """V (n, n), if of the layers no more is known than these variances (2,).
+
+        What is known of leads stays. Of leaks, no more is known than at first: a damp skin dries.
+        """
+        least = np.diagonal(self._prior_covariance).copy()
+        least[:2], least[2] = layers, 0.0
+        return np.diag(np.maximum(np.diagonal(before.covariance), least))
+
+    def _wary_layer_stds(self) -> Float:
+        wary = self._filters[1]
+        return np.hypot(np.sqrt(wary.covariance.diagonal()), wary.means - self.means)[:2]
