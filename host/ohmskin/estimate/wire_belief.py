@@ -77,7 +77,9 @@ error on a skin that lies still. But the upper deviations of its answer are thos
 filter: if wires have just grown longer, cells conduct more than they seem to.
 """
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
@@ -444,32 +446,41 @@ class _Filter(NamedTuple):
     covariance: Float
     score: float = 0.0
 
-    def stepped(
-        self, expected: Float, covariance: Float, information: Float, pull: Float
-    ) -> "_Filter":
-        """This filter after a lesson.
 
-        expected: m_0, (n,). covariance: V before the lesson, (n, n). information: A, (n, n).
-        pull: g_0 at `expected`, (n,).
-        """
-        after = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + information), np.float64)
-        off = self.means - expected
-        here = pull - information @ off
-        score = off @ pull - 0.5 * off @ information @ off + 0.5 * here @ after @ here
-        score -= 0.5 * np.linalg.slogdet(np.eye(len(off)) + covariance @ information)[1]
-        means: Float = np.asarray(self.means + after @ here, np.float64)
-        return _Filter(means, after, MEMORY * self.score + float(score))
+def _stepped(
+    filters: Sequence[_Filter],
+    covariances: Sequence[Float],
+    expected: Float,
+    information: Float,
+    pull: Float,
+) -> list[_Filter]:
+    """These filters after a lesson, before which their V are `covariances`, each (n, n).
+
+    expected: m_0, (n,). information: A, (n, n). pull: g_0 at `expected`, (n,).
+    """
+    before = np.array(covariances)
+    after = np.linalg.inv(np.linalg.inv(before) + information)
+    off = np.array([one.means for one in filters]) - expected
+    here = pull - off @ information
+    moved = (after @ here[..., None])[..., 0]
+    scores = off @ pull - 0.5 * (off @ information * off).sum(axis=1)
+    scores += 0.5 * (here * moved).sum(axis=1)
+    scores -= 0.5 * np.linalg.slogdet(np.eye(len(pull)) + before @ information)[1]
+    return [
+        _Filter(one.means + move, covariance, MEMORY * one.score + score)
+        for one, move, covariance, score in zip(filters, moved, after, scores.tolist(), strict=True)
+    ]
 
 
 def _mixture(one: _Filter, other: _Filter, odds: float) -> _Filter:
     """Mean and covariance of both. odds: of the other to the one, before their scores."""
-    scored_odds = odds * np.exp(min(other.score - one.score, 50.0))
+    scored_odds = odds * math.exp(min(other.score - one.score, 50.0))
     share = scored_odds / (1 + scored_odds)
     apart = other.means - one.means
     covariance = (1 - share) * one.covariance + share * other.covariance
     covariance += share * (1 - share) * np.outer(apart, apart)
-    score = one.score + np.log1p(scored_odds) - np.log1p(odds)
-    return _Filter(one.means + share * apart, covariance, float(score))
+    score = one.score + math.log1p(scored_odds) - math.log1p(odds)
+    return _Filter(one.means + share * apart, covariance, score)
 
 
 class LearnedWires(WireBelief):
@@ -526,15 +537,13 @@ class LearnedWires(WireBelief):
         weights = per_log.T @ np.linalg.inv(np.eye(len(gain)) - gain @ per_mean_std) @ gain
         information, pull = weights @ per_mean_std @ per_log, weights @ residual
         steady, wary = self._before_lesson
-        self._filters = [
-            steady.stepped(self.means, self._faded(steady), information, pull),
-            _mixture(
-                wary.stepped(self.means, wary.covariance, information, pull),
-                wary.stepped(self.means, self._changed(wary), information, pull),
-                CHANGED_ODDS,
-            ),
-        ]
-        believed = _mixture(self._filters[0], self._filters[1], WARY_ODDS)
+        expected = self._faded(steady), wary.covariance, self._changed(wary)
+        steady, stayed, changed = _stepped(
+            (steady, wary, wary), expected, self.means, information, pull
+        )
+        wary = _mixture(stayed, changed, CHANGED_ODDS)
+        self._filters = [steady, wary]
+        believed = _mixture(steady, wary, WARY_ODDS)
         self._believe(believed.means, believed.covariance)
 
     def _faded(self, before: _Filter) -> Float:
