@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from network import Network, SkinCircuit, laplacian_readings, skin_network
-from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
+from ohmskin.circuit.skin import PortCircuit, Skin, all_readings, end_admittance, readings
 from places import DATA
 
 CROSSBARS = json.loads((DATA / "qucs_crossbars.json").read_text())
@@ -117,3 +117,34 @@ def test_a_short_joins_the_ends_of_an_unbalanced_bridge() -> None:
 def test_what_no_path_joins_to_a_source_has_no_potential() -> None:
     node_v = network((0, 1, 10), (1, 2, np.inf), (2, 3, 10), (3, 4, 0)).node_v({0: 2.0})
     np.testing.assert_array_equal(node_v, [2, 2, np.nan, np.nan, np.nan])
+
+
+@pytest.mark.parametrize("far", [(False, False), (True, False), (False, True), (True, True)])
+def test_a_short_of_near_ends_is_that_of_the_network(far: tuple[bool, bool]) -> None:
+    random = np.random.default_rng(4)
+    rows, columns = shape = (4, 3)
+    skin = Skin(
+        np.exp(random.normal(-10, 2, shape)),
+        np.exp(random.normal(5, 1, shape)),
+        np.exp(random.normal(6, 1, shape)),
+    )
+    circuit = PortCircuit(skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm, far=far)
+    firsts = np.array([0, 2, rows + 1])
+    found = circuit.shorted_port_ohm(firsts, 30.0)
+    alone = skin_network(skin)
+    top, bottom = np.arange(rows + columns, alone.nodes).reshape(2, rows, columns)
+    row_ends = top[:, -1] if far[0] else np.arange(rows)
+    column_ends = bottom[-1] if far[1] else np.arange(rows, rows + columns)
+    for number, first in enumerate(firsts):
+        for i, j in np.ndindex(shape):
+            source = alone.nodes
+            network = Network(
+                alone.nodes + 1,
+                np.append(alone.tail, [first, source]),
+                np.append(alone.head, [first + 1, i]),
+                np.append(alone.branch_ohm, [30.0, 1e3]),
+            )
+            volt = network.node_v({source: 1.0, rows + j: 0.0})
+            current = (1.0 - volt[i]) / 1e3
+            port_ohm = (volt[row_ends[i]] - volt[column_ends[j]]) / current
+            assert found[i * columns + j, number] == pytest.approx(port_ohm, rel=1e-9)

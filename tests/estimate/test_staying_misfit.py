@@ -13,17 +13,20 @@ from ohmskin.circuit.skin import Skin, port_resistance_ohm
 from ohmskin.estimate import full_fit
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
-from ohmskin.estimate.joint import STAYING_FAULT
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import LAYER_STD, LEAD_STD, REST_STD, SEGMENT_STD, CellPrior
+from ohmskin.estimate.staying_faults import STAYING_FAULT
 from ohmskin.estimate.wire_belief import LearnedWires
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ENUMS, MODES
-from studies.trials import Trial, bent_trial, jump_trial, palm_trial, random_trial
+from studies.trials import Trial, bent_trial, finger_trial, jump_trial, palm_trial, random_trial
 
 FRAMES = 50
+SHOWN = "all touches look like it"
+SHORTED = f"rows 3 and 4: shorted? {SHOWN}"
+BROKEN = f"row 2: is its yarn broken? {SHOWN}"
 
 
 def led(skin: Skin) -> Skin:
@@ -32,13 +35,27 @@ def led(skin: Skin) -> Skin:
 
 
 def estimates(
-    trial: Trial, method: str, mode: str = "near", short_ohm: float = 0.0, noise_lsb: float = 0.3
+    trial: Trial,
+    method: str,
+    mode: str = "near",
+    *,
+    short_ohm: float = 0.0,
+    segment_times: float = 1.0,
+    noise_lsb: float = 0.3,
 ) -> list[Estimate]:
-    """All frames; short_ohm: between rows 3 and 4, in front of their leads, after the tare."""
+    """All frames, by 10 bits.
+
+    After the tare, there is a short between rows 3 and 4, in front of their leads; or the second
+    segment of row 2 has so many times its resistance.
+    """
     names = [ENUMS["reading"].values[name] for name in MODES[mode]]
     short = (np.array([[3], [4]]), np.array([short_ohm])) if short_ohm else None
+    times = np.ones(trial.rest.shape)
+    times[2, 1] = segment_times
     frames = [
-        SkinCircuit(led(skin), short).readings(skin.cell_siemens)[..., names]
+        SkinCircuit(led(replace(skin, top_wire_ohm=skin.top_wire_ohm * times)), short).readings(
+            skin.cell_siemens
+        )[..., names]
         for skin in trial.frames
     ]
     rest = SkinCircuit(led(trial.rest)).readings(trial.rest.cell_siemens)[..., names]
@@ -58,7 +75,33 @@ def test_a_short_of_20_ohm_flags_most_frames_once_some_have_shown_it(method: str
     found = estimates(random_trial(8, 8, 8, FRAMES, 24001), method, short_ohm=20.0)
     late = found[20:]
     assert sum(one.converged for one in late) <= 6
-    assert sum(one.message == STAYING_FAULT for one in late) >= 3  # that nothing else flags
+    assert sum(one.message == SHORTED for one in late) >= 15
+
+
+@pytest.mark.parametrize(
+    ("mode", "method"), [("near", "joint"), ("near", "touch"), ("half", "joint"), ("far", "joint")]
+)
+@pytest.mark.parametrize(
+    ("damage", "named"), [({"short_ohm": 20.0}, SHORTED), ({"segment_times": 30.0}, BROKEN)]
+)
+def test_a_damage_is_named_after_some_touches_and_no_other_line_is(
+    damage: dict[str, float], named: str, mode: str, method: str
+) -> None:
+    named_in = 0
+    for seed in range(3):
+        trial = random_trial(8, 8, 8, 120, 500 + seed)
+        messages = [one.message for one in estimates(trial, method, mode, **damage)]
+        assert {one for one in messages if one.endswith(SHOWN)} <= {named}
+        named_in += named in messages
+    assert named_in >= 2
+
+
+@pytest.mark.parametrize("mode", ["near", "far"])
+def test_fingertips_show_a_short_that_no_frame_of_them_shows(mode: str) -> None:
+    trial = finger_trial(8, 8, 80, 3)
+    messages = [one.message for one in estimates(trial, "joint", mode, short_ohm=20.0)]
+    assert SHORTED in messages
+    assert {one for one in messages if one.endswith(SHOWN)} == {SHORTED}
 
 
 @pytest.mark.parametrize("method", ["joint", "touch"])
@@ -79,8 +122,9 @@ def test_a_short_of_20_ohm_flags_most_frames_once_some_have_shown_it(method: str
 def test_a_sound_skin_is_never_said_to_be_damaged(trial: Trial, mode: str, method: str) -> None:
     # One reading of each cell shows no noise, if nothing else has: it counts as that of a code.
     for noise_lsb in (0.3,) if mode == "quick" else (0.3, 3.0):
-        found = estimates(trial, method, mode, noise_lsb=noise_lsb)
-        assert STAYING_FAULT not in [one.message for one in found]
+        messages = [one.message for one in estimates(trial, method, mode, noise_lsb=noise_lsb)]
+        assert STAYING_FAULT not in messages
+        assert not [one for one in messages if one.endswith(SHOWN)]
 
 
 class NormalPrior(CellPrior):

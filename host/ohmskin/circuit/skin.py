@@ -441,6 +441,25 @@ class PortCircuit:
         slopes *= ohm.ravel()
         return slopes
 
+    def shorted_port_ohm(self, first: NDArray[np.intp], short_ohm: float) -> Float:
+        """`port_ohm` if two near ends were joined, for each of k shorts by itself, (RC, k) [ohm].
+
+        first: the first electrode of each short, of R+C; the other is the next one, (k,).
+        short_ohm: what joins them, above 0.
+
+        A current of one through a port makes the voltage x between both near ends. Joined, they
+        carry x / (z + short_ohm), where z is their own port resistance (Thevenin). By reciprocity,
+        this lowers the voltage at the sensed ends by xs of it: x for a current that flows through
+        the sensed ends.
+        """
+        x, sensed = (
+            port_difference((each[first] - each[first + 1]).T, self.rows)
+            for each in (self.impedance, self.sensed)
+        )
+        apart = self.impedance[first] - self.impedance[first + 1]
+        z = apart[np.arange(len(first)), first] - apart[np.arange(len(first)), first + 1]
+        return np.asarray(self.port_ohm[:, None] - x * sensed / (z + short_ohm))
+
     def by_cell(self) -> Float:
         """Slopes by the log resistance of each cell, (RC, RC) [ohm]."""
         return self._slopes(self.cell_current, self.sense_current, self._root**-2.0)

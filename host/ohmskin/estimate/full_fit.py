@@ -393,6 +393,32 @@ class FullFit:
         factor = cholesky(gram(by_cell, onto=self._with_leads(self._own_lead_ohm)))
         return -self._cell_std[:, None] * (by_cell.T @ solve(factor, slopes))
 
+    def gains_of_shorts(self, first: NDArray[np.intp]) -> Float:
+        """How much better shorts explain the frame (`staying_faults`).
+
+        first: the first electrode of each short, of R+C; the other is the next one, (k,).
+        Returns the gains in twice the log likelihood, (k,).
+        """
+        # The leads of both lines are in the way, and no short has less than an ohm.
+        loop_ohm = 2 * max(float(self._means[2]), 1.0)
+        changed_ohm = (
+            self._circuit.shorted_port_ohm(first, loop_ohm) - self._circuit.port_ohm[:, None]
+        )
+        modelled = self._modelled[:, None]
+        return self._gains((1 / (1 / modelled + changed_ohm) - modelled) * self._weight[:, None])
+
+    def gains_of_yarns(self) -> Float:
+        """How much better a broken yarn of each line explains the frame, (R+C,): as for shorts."""
+        rows, columns = self._circuit.shape
+        by_wires = self._by_segment.reshape(-1, 2, rows, columns) / SEGMENT_STD
+        return self._gains(np.hstack([by_wires[:, 0].sum(axis=2), by_wires[:, 1].sum(axis=1)]))
+
+    def _gains(self, changes: Float) -> Float:
+        """How much better the frame is explained if h changes so, (k,), from (RC, k)."""
+        whitened = solve_lower(self._factor, changes)
+        square = np.einsum("ij,ij->j", whitened, whitened)
+        return np.asarray(2 * self._probable_noise @ changes - square)
+
     @property
     def lesson(self) -> Lesson:
         """What the readings say of the means, however hard the touches are."""

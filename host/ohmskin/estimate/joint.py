@@ -48,6 +48,7 @@ from ohmskin.estimate.prior import (
 )
 from ohmskin.estimate.region_fit import Answer, RegionFit, WholeFrame
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_touches
+from ohmskin.estimate.staying_faults import StayingFaults
 from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, LearnedWires, WireBelief
 
 # The first two numbers are chosen. `make ablate` tries other ones; the table "What each number
@@ -79,22 +80,12 @@ LEAK_MOVE_US: Final = 5e-3
 # Standard deviation of a leak, as a share of it: leaks differ from crossing to crossing, and become
 # less while the skin dries. Chosen.
 LEAK_STD: Final = 0.2
-# The skin is at fault, and not a single frame, if the running mean of the frames' surprise
-# (`FullFit.surprise`) is above this. Chosen: on sound skins, dense touches have a surprise of up to
-# 1.
-STAYING_SURPRISE: Final = 1.2
-STAYING_FAULT: Final = (
-    "other frames fit no touches: is a line shorted, or a yarn broken? ask the doctor"
-)
-# Weight of the newest frame in this running mean.
-SURPRISE_SHARE: Final = 0.1
-# No frame enters the mean with more surprise, and a frame that nothing explains enters it with
-# this. Chosen: more than half of the frames have to be odd before the skin is at fault.
-MOST_SURPRISE: Final = 1.8
-# A frame whose touch is spread over a larger share of the cells does not enter it. Chosen: two of
-# the widest fingertips have 0.38 of 8x8 cells, and palms that no fit finds had 0.42 and more.
+# A frame whose touch is spread over a larger share of the cells tells of no fault that stays.
+# Chosen: two of the widest fingertips have 0.38 of 8x8 cells, and palms that no fit finds had 0.42
+# and more.
 TELLING_SHARE: Final = 0.4
-# Skins of fewer ports have no such mean. Chosen: on 3x3, a few odd readings spoil a whole frame.
+# Skins of fewer ports are told no such fault. Chosen: on 3x3, a few odd readings spoil a whole
+# frame.
 LEAST_STAYING_PORTS: Final = 16
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
 # by less than their rounding.
@@ -161,7 +152,7 @@ class JointEstimator(Estimator):
         # (R, C) [S]: what `matrix` found in the last frame that it was asked about.
         self._cells_before: Float | None = None
         self._touches = 0  # touched cells in the last fit
-        self._surprise = 0.0  # running mean of the surprise of the fits so far
+        self._staying = StayingFaults(self._shape)
         # The last whole frame, for regions of the frames after it; and the last region.
         self._whole: FullFit | Touched | WholeFrame | None = None
         self._whole_message = ""  # why that frame is no answer, in words, or empty
@@ -239,12 +230,11 @@ class JointEstimator(Estimator):
         # cells at the edge of a palm would seem to conduct less than at rest.
         message = self._doubt(fit_prior, fit)
         # A palm tells of no fault: that so many cells are pressed is a surprise by itself.
-        tells_of_fault = not (ports.fault or again or spread_share > TELLING_SHARE)
-        if tells_of_fault and ports.current.size >= LEAST_STAYING_PORTS:
-            surprise = MOST_SURPRISE if message else min(fit.surprise, MOST_SURPRISE)
-            self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
-        if not message and self._surprise > STAYING_SURPRISE:
-            message = STAYING_FAULT
+        silent = ports.fault or again or self._hides_rest or spread_share > TELLING_SHARE
+        if not silent and ports.current.size >= LEAST_STAYING_PORTS:
+            self._staying.compare(fit, is_doubted=bool(message))
+        if not ports.fault:
+            message = self._staying.named or message or self._staying.unnamed
         solution = self._solution(ports, fit, message)  # now: a lesson moves the belief
         # A crowded frame teaches nothing: other forces explain it as well as other wires do.
         if ports.fault or message or prior.is_crowded(fit.log_cells):
@@ -261,8 +251,7 @@ class JointEstimator(Estimator):
         few. So after a fit with many touches nothing is looked for. Nor is it where wires hide even
         the cells at rest: there nobody can be sure that touches are few.
         """
-        hidden = self._rest_wires_log_std > REST_STD
-        if hidden or self._touches > most_touches(self._shape):
+        if self._hides_rest or self._touches > most_touches(self._shape):
             return None
         if self._finder is None or self._finder.prior is not prior:
             self._finder = SparseFit(prior, self._belief, self.knowledge.ref_ohm)
@@ -331,7 +320,7 @@ class JointEstimator(Estimator):
             return message
         # On a leaky skin, short lines hide cells at rest as well. That is no reason to doubt: a
         # touch conducts more than a cell at rest, and short lines do not hide it.
-        if self._rest_wires_log_std > REST_STD and self._line_ohm() > LONG_LINE_OHM:
+        if self._hides_rest and self._line_ohm() > LONG_LINE_OHM:
             return "wires resist too much: even cells at rest are uncertain"
         if fit.misfit > MAX_CHI2:
             return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
@@ -344,6 +333,11 @@ class JointEstimator(Estimator):
             cell = cell_of(loss.argmax(), log_cells)
             return f"{cell}: conducts less than at rest, is a line open?"
         return ""
+
+    @property
+    def _hides_rest(self) -> bool:
+        """Whether wires resist so much that they hide even the cells at rest."""
+        return self._rest_wires_log_std > REST_STD
 
     def _line_ohm(self) -> float:
         """Resistance of the wire of a row or of a column, whichever is more, end to end [ohm]."""
@@ -454,8 +448,9 @@ class JointEstimator(Estimator):
         self._belief.fix_rest_wires()
         self._rest_wires_log_std = float(fit.wires_log_std.max())
         # Where wires hide even cells at rest, cells depend on the wires too strongly for slopes.
-        hidden = self._rest_wires_log_std > REST_STD
-        by_means = np.zeros((log_cells.size, len(means))) if hidden else fit.cells_by_means()
+        by_means = np.zeros((log_cells.size, len(means)))
+        if not self._hides_rest:
+            by_means = fit.cells_by_means()
         std = np.hypot(np.minimum(fit.log_cells_std, UNTOUCHED_STD), REST_STD)
         return CellPrior(log_cells, std, by_means, means)
 
