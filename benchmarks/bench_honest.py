@@ -24,7 +24,8 @@ references  of each mode: both off by 5 %, of which estimators are told 1 % or 5
 damp    of each mode: neighbouring stripes leak into each other by so many ohm at every crossing.
 palms   a palm over 60 % of the skin, with peaks of about 250 uS (firm); cells of 200 and 30 kOhm at
         rest (rest_200000, rest_30000). error, p90: of pressed cells, median and 90th percentile.
-damages a segment of ten times its resistance (segment), 20 ohm between two rows (short).
+damages a segment of ten times its resistance (segment), 20 ohm between two rows (short). named:
+        scenes in which a message names these rows. misnamed: scenes in which one names others.
 untold  wires of 150, 500, 1000 and 2000 ohm a segment.
 """
 
@@ -112,6 +113,7 @@ class Shown(NamedTuple):
     off: Bool
     flagged: Bool
     named: bool
+    misnamed: bool
     within: Bool
     error: Float
 
@@ -196,6 +198,16 @@ def read_scene(scene: Scene) -> tuple[Scene, Shown]:
     return scene, shown(scene, found, cells[before:], rest.cell_siemens)
 
 
+def damaged_lines(scene: Scene) -> str:
+    """How a message names what is wrong in this scene."""
+    row = scene.seed * 7 % (SHAPE[0] * SHAPE[1]) // SHAPE[1]
+    if scene.fault == "segment":
+        return f"row {row}:"
+    if scene.fault == "short":
+        return f"rows {row % (SHAPE[0] - 1)} and {row % (SHAPE[0] - 1) + 1}"
+    return f"far row {LINE}" if "line" in scene.fault else f"far {scene.fault.split('_')[0]}"
+
+
 def shown(scene: Scene, found: list[Estimate], cells: Float, rest_siemens: Float) -> Shown:
     """Judge these frames of a scene by its cells (F, R, C) [S]."""
     flagged = np.array([not one.converged for one in found])
@@ -212,10 +224,14 @@ def shown(scene: Scene, found: list[Estimate], cells: Float, rest_siemens: Float
     ]
     pressed = cells > rest_siemens + PRESSED_SIEMENS
     within = (off_siemens <= STATED_STDS * stds) | flagged[:, None, None]
-    name = f"far row {LINE}" if "line" in scene.fault else f"far {scene.fault.split('_')[0]}"
-    named = any(name in one.message for one in found)
+    named = any(damaged_lines(scene) in one.message for one in found)
+    misnamed = any(
+        damage in one.message and damaged_lines(scene) not in one.message
+        for one in found
+        for damage in ("shorted?", "yarn broken?")
+    )
     error = (off_siemens / cells)[pressed]
-    return Shown(np.array(wrong), np.asarray(off), flagged, named, within[pressed], error)
+    return Shown(np.array(wrong), np.asarray(off), flagged, named, misnamed, within[pressed], error)
 
 
 class Pooled(dict[str, float | None]):
@@ -240,6 +256,7 @@ class Pooled(dict[str, float | None]):
                 ("flagged", flagged.mean()),
                 ("right_but_flagged", (flagged & ~off).mean()),
                 ("named", named),
+                ("misnamed", np.mean([one.misnamed for one in shown_of])),
                 ("error", np.median(error)),
                 ("error_p90", np.quantile(error, 0.9)),
             ):
@@ -350,9 +367,11 @@ def of_damages(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
         skin._replace(name=fault, fault=fault)
         for fault, skin in product(("segment", "short"), skins_of(part, seed, mode="near"))
     ]
-    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged")
+    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged", "named")
     for fault in ("segment", "short"):
         found.bar(at_most, fault, "wrong", 2)
+        found.bar(at_most, fault, "misnamed", 0)
+    found.bar(at_least, "short", "named", 100)
     return found
 
 
