@@ -85,7 +85,7 @@ LEAKS_OHM = (3_000_000, 1_000_000, 300_000)
 class Scene(NamedTuple):
     """A skin, touched in one way, read by a method; name: of the figures it belongs to.
 
-    fault: of `FAULTS` or `DAMAGES`. references: shares by which both are off.
+    fault: of `FAULTS`, "segment" or "short". references: shares by which both are off.
     """
 
     name: str
@@ -367,7 +367,7 @@ def of_damages(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
         skin._replace(name=fault, fault=fault)
         for fault, skin in product(("segment", "short"), skins_of(part, seed, mode="near"))
     ]
-    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged", "named")
+    found = Pooled(scenes, jobs, progress).only("wrong", "within_4", "flagged", "named", "misnamed")
     for fault in ("segment", "short"):
         found.bar(at_most, fault, "wrong", 2)
         found.bar(at_most, fault, "misnamed", 0)

@@ -132,3 +132,20 @@ def test_leaks_at_the_ends_of_lines_are_nearly_those_at_each_crossing() -> None:
     circuit = PortCircuit(cells, 100.0, 200.0, leak_siemens=(1e-6, 1e-6))
     current = 1 / (circuit.port_ohm.reshape(8, 8) + skin.ref_top_ohm + skin.ref_bottom_ohm)
     np.testing.assert_allclose(current, exact, rtol=6e-3)
+
+
+@pytest.mark.parametrize("shape", [(1, 16), (16, 1)])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_single_line_has_no_neighbour_to_leak_into(
+    shape: tuple[int, int], method: type[JointEstimator]
+) -> None:
+    """Its slope by these leaks is 0, and they are known to be none."""
+    cells = np.full(shape, 5e-6)
+    skin = Skin(cells, np.full(shape, 100.0), np.full(shape, 200.0))
+    circuit = SkinCircuit(skin, leaks(shape, 3e5))
+    reader = estimator(method, circuit.readings(cells)[..., :4], "near")
+    reader.estimate(circuit.readings(cells)[..., :4])
+    pressed = cells.copy()
+    pressed.flat[3] = 1e-4
+    found = reader.estimate(circuit.readings(pressed)[..., :4])
+    assert found.touched.sum() == found.touched.flat[3] == 1

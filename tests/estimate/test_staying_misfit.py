@@ -45,7 +45,7 @@ def estimates(
 ) -> list[Estimate]:
     """All frames, by 10 bits.
 
-    After the tare, there is a short between rows 3 and 4, in front of their leads; or the second
+    After the tare, there is a short between rows 3 and 4, where their leads end; or the second
     segment of row 2 has so many times its resistance.
     """
     names = [ENUMS["reading"].values[name] for name in MODES[mode]]

@@ -14,6 +14,7 @@ from ohmskin.circuit.skin import PortCircuit, Skin, port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CHANGED_ODDS,
     LAYER_STD,
@@ -304,6 +305,30 @@ def test_wires_far_from_what_is_expected_are_learned(method: str) -> None:
         for ratio in trial.rounded(10).ratio:
             estimator.estimate(ratio)
         assert estimator.wires().both == pytest.approx((1000.0, 1000.0), rel=0.2)
+
+
+class SilentFit:
+    """A fit of a new touch, whose lesson says nothing."""
+
+    log_cells = np.zeros(16)
+    lesson = Lesson(np.full((4, 3), 1e-9), np.zeros(4), np.eye(4))
+
+
+def test_a_lesson_that_says_nothing_asks_for_no_other_fit() -> None:
+    """Whether fits before and after it expect the usual lead, or the one that is known."""
+    belief = LearnedWires((4, 4), WireOhm())
+    slopes = np.zeros((4, 3))
+    slopes[0, 2] = 1 / 600
+    strong = Lesson(belief.per_mean_std(slopes), np.array([1.6, 0.0, 0.0, 0.0]), np.eye(4))
+    gram = strong.per_mean_std @ strong.per_mean_std.T + np.eye(4)
+    belief.take(strong._replace(factor=np.linalg.cholesky(gram)))
+    belief.expect_usual_leads(False)
+    known = belief.means[2]
+    belief.expect_usual_leads(True)
+    assert abs(known - belief.means[2]) > 150  # what asks for another fit
+    ports = PortReadings(np.zeros((4, 4)), np.zeros((4, 4)), np.ones((4, 4)))
+    belief.expect_usual_leads(False)
+    assert not belief.after_fit(SilentFit(), ports)
 
 
 def learned(by_mean: Float, noise: Float, at: Float, faded: Float) -> tuple[float, Float, Float]:

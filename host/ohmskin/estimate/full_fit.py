@@ -393,16 +393,14 @@ class FullFit:
         factor = cholesky(gram(by_cell, onto=self._with_leads(self._own_lead_ohm)))
         return -self._cell_std[:, None] * (by_cell.T @ solve(factor, slopes))
 
-    def gains_of_shorts(self, first: NDArray[np.intp]) -> Float:
+    def gains_of_shorts(self, first: NDArray[np.intp], short_ohm: float) -> Float:
         """How much better shorts explain the frame (`staying_faults`).
 
-        first: the first electrode of each short, of R+C; the other is the next one, (k,).
+        first, short_ohm: as `PortCircuit.shorted_port_ohm` has them, (k,).
         Returns the gains in twice the log likelihood, (k,).
         """
-        # The leads of both lines are in the way, and no short has less than an ohm.
-        loop_ohm = 2 * max(float(self._means[2]), 1.0)
         changed_ohm = (
-            self._circuit.shorted_port_ohm(first, loop_ohm) - self._circuit.port_ohm[:, None]
+            self._circuit.shorted_port_ohm(first, short_ohm) - self._circuit.port_ohm[:, None]
         )
         modelled = self._modelled[:, None]
         return self._gains((1 / (1 / modelled + changed_ohm) - modelled) * self._weight[:, None])
@@ -414,10 +412,15 @@ class FullFit:
         return self._gains(np.hstack([by_wires[:, 0].sum(axis=2), by_wires[:, 1].sum(axis=1)]))
 
     def _gains(self, changes: Float) -> Float:
-        """How much better the frame is explained if h changes so, (k,), from (RC, k)."""
-        whitened = solve_lower(self._factor, changes)
-        square = np.einsum("ij,ij->j", whitened, whitened)
-        return np.asarray(2 * self._probable_noise @ changes - square)
+        """How much better the frame is explained if h changes so, (k,), from (RC, k).
+
+        Where the residual pulls the other way, no more is said than that: the gain is at most this.
+        """
+        gains = np.asarray(2 * self._probable_noise @ changes)
+        some = gains > 0
+        whitened = solve_lower(self._factor, changes[:, some])
+        gains[some] -= np.einsum("ij,ij->j", whitened, whitened)
+        return gains
 
     @property
     def lesson(self) -> Lesson:

@@ -469,7 +469,9 @@ class JointEstimator(Estimator):
             fit = self._fit_rest(ports, fit.log_cells)
             if fit.message:
                 break
-        self._belief.expect_leaks(leaks_us, np.hypot(stds_us, LEAK_STD * leaks_us))
+        # A single line leaks into none, and nothing says so to its slopes.
+        stds_us = np.maximum(np.hypot(stds_us, LEAK_STD * leaks_us), SEARCHED_LEAK_STD_US)
+        self._belief.expect_leaks(leaks_us, stds_us)
         return self._fit_rest(ports, fit.log_cells, 1)  # to expect leaks has reset the wires
 
     def _fit_rest(self, ports: PortReadings, log_cells: Float, fits: int = REST_FITS) -> FullFit:

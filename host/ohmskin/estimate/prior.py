@@ -200,8 +200,8 @@ class WireStds(NamedTuple):
     """How well the means of a skin's wires are known.
 
     layer_std: standard deviation of the log of the mean segment, of the layer that is known less.
-        It minds that wires may just have changed.
-    layer_std_ratio: the same over the one that fits take.
+        It allows for wires that may just have changed.
+    layer_std_ratio: such a deviation over the one that fits take, of the layer where it is more.
     lead_std_ratio: deviation of the mean lead as known, over the one that fits take (under
         fingertips, fits expect usual leads).
     reach_stds: how many deviations away the upper limit is.
@@ -241,7 +241,7 @@ def siemens_std(
     # The cell conducts most if its wires resist most. Wires are normal in their log. So at the
     # upper limit they are exp(k layer_std) - 1 above their mean, where the first order has
     # k layer_std. The part of the deviation that comes from wires grows by this ratio. It grows by
-    # one more, because wires may just have grown longer, which fits do not expect. At the lower
+    # a second one, because wires may just have grown longer, which fits do not expect. At the lower
     # limit, wires are off by less than k layer_std, so there the first order is enough.
     # The mean lead may be larger than the fit expects, which widens the deviation upwards alone: a
     # lead cannot be as much smaller, because none is below 0.

@@ -5,8 +5,7 @@ Touches alone explain a frame of a damaged skin more or less, with cells that ar
 the damage is in the next frame as well, and other touches are not. So each frame is asked how much
 better a damage would explain it, and what frames answer is added up.
 
-**Short** of two neighbouring lines, at their electrodes: `PortCircuit.shorted_port_ohm`, with the
-leads of both lines between them.
+**Short** of two neighbouring lines, where their leads end: `PortCircuit.shorted_port_ohm`.
 
 **Broken yarn** of a line: all its segments resist twice as much. That a single segment resists ten
 times as much looks about the same to the cells behind it.
@@ -34,13 +33,16 @@ from ohmskin.arrays import Float
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.prior import MAX_STEP_LOG
 
+# Resistance of a short [ohm]. Chosen: of two threads that touch. Most shorts of up to some hundred
+# ohm look about the same.
+SHORT_OHM: Final = 20.0
 # What one touch adds to a sum, or takes from it, at the most. Chosen: five touches have to agree.
 MOST_GAIN: Final = 8.0
 # A sum from here on is a damage. Chosen: of 168 simulated sound boards, and 160 skins of up to 300
 # touches with wires of 10 to 30 % scatter, the largest was 23.
 CERTAIN_GAIN: Final = 40.0
 # No sum is larger. Chosen: three touches that contradict take a damage back that is no more.
-MOST_SUM: Final = 64.0
+MOST_SUM: Final = 60.0
 
 # The skin is at fault, and not a single frame, if the running mean of the frames' surprise is above
 # this. Chosen: on sound skins, dense touches have a surprise of up to 1.
@@ -60,24 +62,20 @@ class StayingFaults:
         rows, columns = self._shape = shape
         # The first line of each short, of R+C: its other line is the next one.
         self._pairs = np.concatenate([np.arange(rows - 1), np.arange(rows, rows + columns - 1)])
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the frames so far."""
         self._surprise = 0.0
         self._shorts, self._yarns = np.zeros(len(self._pairs)), np.zeros(sum(self._shape))
         self._log_cells: Float | None = None
 
     def compare(self, fit: FullFit, *, is_doubted: bool) -> None:
-        """Count this frame. is_doubted: its fit explains nothing."""
+        """Count this frame. is_doubted: its fit is no answer; it may show a damage all the same."""
         surprise = MOST_SURPRISE if is_doubted else min(fit.surprise, MOST_SURPRISE)
         self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
         before = self._log_cells
         if before is not None and np.abs(fit.log_cells - before).max() < MAX_STEP_LOG:
             return
         self._log_cells = fit.log_cells
-        shorts, yarns = fit.gains_of_shorts(self._pairs), fit.gains_of_yarns()
-        # A short looks like broken yarns, too, and not the other way round.
+        shorts, yarns = fit.gains_of_shorts(self._pairs, SHORT_OHM), fit.gains_of_yarns()
+        # A short looks like broken yarns, too; a broken yarn does not look like a short.
         self._shorts = _summed(self._shorts, shorts)
         self._yarns = _summed(self._yarns, yarns - max(float(shorts.max(initial=0.0)), 0.0))
 
@@ -90,11 +88,11 @@ class StayingFaults:
     def named(self) -> str:
         """The damage that touches have shown, in words, or empty."""
         shorts, yarns = self._shorts, self._yarns
-        if shorts.max(initial=0.0) > CERTAIN_GAIN:
+        if shorts.max(initial=0.0) >= CERTAIN_GAIN:
             line, number = self._line(int(self._pairs[shorts.argmax()]))
             return f"{line}s {number} and {number + 1}: shorted? all touches look like it"
         # If the wires of all lines were longer than believed, none would be broken.
-        if yarns.max() > CERTAIN_GAIN and np.count_nonzero(yarns > 0.5 * CERTAIN_GAIN) == 1:
+        if yarns.max() >= CERTAIN_GAIN and np.count_nonzero(yarns > 0.5 * CERTAIN_GAIN) == 1:
             line, number = self._line(int(yarns.argmax()))
             return f"{line} {number}: is its yarn broken? all touches look like it"
         return ""

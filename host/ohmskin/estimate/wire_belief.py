@@ -57,14 +57,15 @@ A skin bends. So there are two filters. The steady one is for a skin that lies s
 before a lesson, a small share of what it knows of the layers fades, so that it follows a slow
 drift. The wary one takes each lesson twice: for wires that are what they were, and, with the odds
 `CHANGED_ODDS`, for wires that have changed since the last lesson, so that no more is known of the
-layers than if nobody had told them. It goes on with the mixture of both, by its mean and its
-covariance. (Such a filter is called generalized pseudo-Bayesian, of first order: Bar-Shalom, Li,
-Kirubarajan, *Estimation with Applications to Tracking and Navigation*, chapter 11.)
+layers than if nobody had told them (of a skin that may not be bent: than was told). It goes on with
+the mixture of both, by its mean and its covariance. (Such a filter is called generalized
+pseudo-Bayesian, of first order: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to
+Tracking and Navigation*, chapter 11.)
 
 The odds of a mixture are those before the lesson, times the exponential of a difference of scores.
-A score says how well the lesson was expected: it is the log likelihood, without what is the same
-for all. With m_0 the mean that the fit had, d = m - m_0, g_0 = L J^T N^-1 z at m_0, g = g_0 - A d,
-V before and V' after the lesson,
+A score says how well the lesson was expected: it is the log likelihood, without terms that all have
+in common. With m_0 the mean that the fit had, d = m - m_0, g_0 = L J^T N^-1 z at m_0,
+g = g_0 - A d, V before and V' after the lesson,
 
     score = d . g_0 - d . A d / 2 + (g . V' g - log det(1 + V A)) / 2 .
 
@@ -73,8 +74,8 @@ any lesson. A filter adds up its scores, and at each lesson the sum keeps the sh
 it was.
 
 Most lessons say too little to show a change. A fit takes what is believed, which has the least
-error on a skin that lies still. But the upper deviations of its answer are those of the wary
-filter: if wires have just grown longer, cells conduct more than they seem to.
+error on a skin that lies still. But the upper deviations of its answer are as wide as those of the
+wary filter: if wires have just grown longer, cells conduct more than they seem to.
 """
 
 import math
@@ -474,13 +475,13 @@ def _stepped(
 
 def _mixture(one: _Filter, other: _Filter, odds: float) -> _Filter:
     """Mean and covariance of both. odds: of the other to the one, before their scores."""
-    scored_odds = odds * math.exp(min(other.score - one.score, 50.0))
-    share = scored_odds / (1 + scored_odds)
+    log_odds = math.log(odds) + other.score - one.score
+    share = 1.0 / (1.0 + math.exp(min(-log_odds, 500.0)))
     apart = other.means - one.means
     covariance = (1 - share) * one.covariance + share * other.covariance
     covariance += share * (1 - share) * np.outer(apart, apart)
-    score = one.score + math.log1p(scored_odds) - math.log1p(odds)
-    return _Filter(one.means + share * apart, covariance, score)
+    score = one.score + np.logaddexp(0.0, log_odds) - math.log1p(odds)
+    return _Filter(one.means + share * apart, covariance, float(score))
 
 
 class LearnedWires(WireBelief):
@@ -510,9 +511,9 @@ class LearnedWires(WireBelief):
         if not (again or is_news or noise < self._lesson_noise):
             return False
         self._lesson_cells, self._lesson_noise = fit.log_cells, noise
-        before = self.means
+        before = self._known.means
         self.take(fit.lesson, replace_last=again or not is_news)
-        moved = np.abs(self.means - before)[:3]
+        moved = np.abs(self._known.means - before)[:3]
         return bool((moved > [LARGE_MOVE_LOG, LARGE_MOVE_LOG, USUAL_LEAD_STD_OHM]).any())
 
     def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
