@@ -537,7 +537,7 @@ class LearnedWires(WireBelief):
         per_log = np.linalg.inv(self._root)
         weights = per_log.T @ np.linalg.inv(np.eye(len(gain)) - gain @ per_mean_std) @ gain
         information, pull = weights @ per_mean_std @ per_log, weights @ residual
-        steady, wary = self._before_lesson
+        steady, wary = map(self._dried, self._before_lesson)
         expected = self._faded(steady), wary.covariance, self._changed(wary)
         steady, stayed, changed = _stepped(
             (steady, wary, wary), expected, self.means, information, pull
@@ -559,13 +559,18 @@ class LearnedWires(WireBelief):
         return self._widened(before, np.diagonal(self._prior_covariance)[:2])
 
     def _widened(self, before: _Filter, layers: Float) -> Float:
-        """V (n, n), if of the layers no more is known than these variances (2,).
+        """V (n, n), if of the layers no more is known than these variances (2,)."""
+        variances = np.diagonal(before.covariance).copy()
+        variances[:2] = np.maximum(variances[:2], layers)
+        return np.diag(variances)
 
-        What is known of leads stays. Of leaks, no more is known than at first: a damp skin dries.
-        """
-        least = np.diagonal(self._prior_covariance).copy()
-        least[:2], least[2] = layers, 0.0
-        return np.diag(np.maximum(np.diagonal(before.covariance), least))
+    def _dried(self, before: _Filter) -> _Filter:
+        """This filter, with leaks that are no better known than at first: a damp skin dries."""
+        first = np.diagonal(self._prior_covariance)[3:]
+        covariance = before.covariance.copy()
+        covariance[3:] = covariance[:, 3:] = 0.0
+        covariance[3:, 3:] = np.diag(np.maximum(np.diagonal(before.covariance)[3:], first))
+        return before._replace(covariance=covariance)
 
     def _wary_layer_stds(self) -> Float:
         wary = self._filters[1]
