@@ -160,12 +160,13 @@ class SkinWires:
 @dataclass(eq=False)
 class _State:
     """What fits take for the wires: m, V, and what follows: its root, the deviations of m, and the
-    wires, once asked for.
+    wires and how well they are known, once asked for.
     """
 
     means: Float
     covariance: Float
     wires: SkinWires | None = None
+    stds: WireStds | None = None
 
     def __post_init__(self) -> None:
         self.root: Float = np.asarray(np.linalg.cholesky(self.covariance), np.float64)
@@ -357,7 +358,12 @@ class WireBelief(ABC):
         return self.untold and float(self.means_std()[:2].max()) >= LAYER_STD
 
     def stds(self) -> WireStds:
-        """How well the means are known."""
+        """How well the means are known: made once for each belief."""
+        if self._state.stds is None:
+            self._state.stds = self._find_stds()
+        return self._state.stds
+
+    def _find_stds(self) -> WireStds:
         layer_stds, lead_std_ohm = self.means_std()[:2], float(self.means_std()[2])
         wary_stds = np.maximum(self._wary_layer_stds(), layer_stds)
         return WireStds(
