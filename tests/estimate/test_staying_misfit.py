@@ -24,7 +24,7 @@ from ohmskin.link.protocol import ENUMS, MODES
 from studies.trials import Trial, bent_trial, finger_trial, jump_trial, palm_trial, random_trial
 
 FRAMES = 50
-SHOWN = "all touches look like it"
+SHOWN = "many touches look like it: ask the doctor"
 SHORTED = f"rows 3 and 4: shorted? {SHOWN}"
 BROKEN = f"row 2: is its yarn broken? {SHOWN}"
 

@@ -230,9 +230,11 @@ class JointEstimator(Estimator):
         # cells at the edge of a palm would seem to conduct less than at rest.
         message = self._doubt(fit_prior, fit)
         # A palm tells of no fault: that so many cells are pressed is a surprise by itself.
-        silent = ports.fault or again or self._hides_rest or spread_share > TELLING_SHARE
+        silent = ports.fault or again or spread_share > TELLING_SHARE
         if not silent and ports.current.size >= LEAST_STAYING_PORTS:
-            self._staying.compare(fit, is_doubted=bool(message))
+            self._staying.count(fit, is_doubted=bool(message))
+            if not self._hides_rest:
+                self._staying.compare(fit)
         if not ports.fault:
             message = self._staying.named or message or self._staying.unnamed
         solution = self._solution(ports, fit, message)  # now: a lesson moves the belief

@@ -48,6 +48,8 @@ MOST_SUM: Final = 60.0
 # this. Chosen: on sound skins, dense touches have a surprise of up to 1.
 STAYING_SURPRISE: Final = 1.2
 STAYING_FAULT: Final = "other frames fit no touches: is a line damaged? ask the doctor"
+# What a message says of a damage that it names.
+MANY_TOUCHES: Final = "many touches look like it: ask the doctor"
 # Weight of the newest frame in this running mean.
 SURPRISE_SHARE: Final = 0.1
 # No frame enters the mean with more surprise, and a frame that nothing explains enters it with
@@ -66,10 +68,13 @@ class StayingFaults:
         self._shorts, self._yarns = np.zeros(len(self._pairs)), np.zeros(sum(self._shape))
         self._log_cells: Float | None = None
 
-    def compare(self, fit: FullFit, *, is_doubted: bool) -> None:
-        """Count this frame. is_doubted: its fit is no answer; it may show a damage all the same."""
+    def count(self, fit: FullFit, *, is_doubted: bool) -> None:
+        """Count how much this frame surprises the model. is_doubted: its fit is no answer."""
         surprise = MOST_SURPRISE if is_doubted else min(fit.surprise, MOST_SURPRISE)
         self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
+
+    def compare(self, fit: FullFit) -> None:
+        """Ask a new touch for all damages. A fit that is no answer may show one all the same."""
         before = self._log_cells
         if before is not None and np.abs(fit.log_cells - before).max() < MAX_STEP_LOG:
             return
@@ -90,15 +95,15 @@ class StayingFaults:
         shorts, yarns = self._shorts, self._yarns
         if shorts.max(initial=0.0) >= CERTAIN_GAIN:
             line, number = self._line(int(self._pairs[shorts.argmax()]))
-            return f"{line}s {number} and {number + 1}: shorted? all touches look like it"
+            return f"{line}s {number} and {number + 1}: shorted? {MANY_TOUCHES}"
         # If the wires of all lines were longer than believed, none would be broken.
         if yarns.max() >= CERTAIN_GAIN and np.count_nonzero(yarns > 0.5 * CERTAIN_GAIN) == 1:
             line, number = self._line(int(yarns.argmax()))
-            return f"{line} {number}: is its yarn broken? all touches look like it"
+            return f"{line} {number}: is its yarn broken? {MANY_TOUCHES}"
         return ""
 
     def _line(self, electrode: int) -> tuple[str, int]:
-        """ "row" or "column", and its number."""
+        """Whether a line is a row or a column, and its number there."""
         rows = self._shape[0]
         return ("row", electrode) if electrode < rows else ("column", electrode - rows)
 

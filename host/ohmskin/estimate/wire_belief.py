@@ -364,6 +364,7 @@ class WireBelief(ABC):
         return self._state.stds
 
     def _find_stds(self) -> WireStds:
+        """`stds`, of the present state."""
         layer_stds, lead_std_ohm = self.means_std()[:2], float(self.means_std()[2])
         wary_stds = np.maximum(self._wary_layer_stds(), layer_stds)
         return WireStds(
