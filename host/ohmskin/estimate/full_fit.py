@@ -71,6 +71,9 @@ OLD_LOG: Final = 0.15
 # A step is not the last one if the log of a deviation in J would change by more (`_is_last`).
 # Chosen: then it changes by half as much again.
 FOLLOWS_LOG: Final = 0.4
+# What explains a frame better by less does not count (`FullFit.gains_of_shorts`). Chosen: half of a
+# normal residual gains as much by chance.
+LEAST_PULL: Final = 2.0
 # Limits of a cell's log resistance [log ohm].
 _LEAST_LOG_OHM, _MOST_LOG_OHM = -np.log(MAX_CELL_SIEMENS), -np.log(MIN_CELL_SIEMENS)
 
@@ -414,12 +417,14 @@ class FullFit:
     def _gains(self, changes: Float) -> Float:
         """How much better the frame is explained if h changes so, (k,), from (RC, k).
 
-        Where the residual pulls the other way, no more is said than that: the gain is at most this.
+        It is not worked out where the residual pulls the other way, or hardly at all: a gain is no
+        more than this pull.
         """
-        gains = np.asarray(2 * self._probable_noise @ changes)
-        some = gains > 0
+        pull = np.asarray(2 * self._probable_noise @ changes)
+        some = pull > LEAST_PULL
         whitened = solve_lower(self._factor, changes[:, some])
-        gains[some] -= np.einsum("ij,ij->j", whitened, whitened)
+        gains = np.minimum(pull, 0.0)
+        gains[some] = pull[some] - np.einsum("ij,ij->j", whitened, whitened)
         return gains
 
     @property
