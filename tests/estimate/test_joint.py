@@ -31,7 +31,14 @@ from ohmskin.estimate.prior import (
 from ohmskin.estimate.wire_belief import LearnedWires
 from ohmskin.link.codes import quantise, ratio_from_codes
 from skins import reference, ten_bits, told
-from studies.trials import finger_trial, palm_trial, random_trial, skin_at_rest, touch
+from studies.trials import (
+    finger_trial,
+    palm_trial,
+    random_trial,
+    skin_at_rest,
+    stretched,
+    touch,
+)
 
 
 def estimates(name: str, bits: int | None) -> list[tuple[Estimate, dict[str, Float]]]:
@@ -302,3 +309,24 @@ def test_a_firm_palm_is_read_by_the_prior_that_knows_cells_at_rest() -> None:
             pressed = true > trial.rest.cell_siemens + 5e-6
             errors.append(np.abs(found.cell_siemens / true - 1)[pressed])
     assert np.quantile(np.concatenate(errors), 0.9) < 0.29
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_bent_skin_of_few_cells_is_learned_from_many_touches(method: str) -> None:
+    random = np.random.default_rng(3)
+    rest = skin_at_rest(3, 3, random, wire_ohm=(500, 1000))
+    bent = SkinCircuit(stretched(rest, 0.75))
+    at_rest = SkinCircuit(rest).readings(rest.cell_siemens)[..., :4]
+    wires = WireOhm(500, 1000, lead=0.0)
+    knowledge = SkinKnowledge(3, 3, adc_bits=10, rest_ratio=at_rest, nominal_wire_ohm=wires)
+    estimator = make_estimator(method, knowledge)
+    off = []
+    for _ in range(40):
+        cells = touch(rest, 4, random).cell_siemens
+        ratio = bent.readings(cells)[..., :4]
+        found = estimator.estimate(ratio_from_codes(quantise(ratio))).cell_siemens
+        off.append(np.abs(found / cells - 1)[cells > 2 * rest.cell_siemens])
+    learned = estimator.wires()
+    np.testing.assert_allclose(learned.both, (375, 750), rtol=0.15)
+    # If wires were taken to be (500, 1000) all along, it would be 0.13.
+    assert np.quantile(np.concatenate(off[10:]), 0.9) < 0.08

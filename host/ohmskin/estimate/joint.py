@@ -238,8 +238,8 @@ class JointEstimator(Estimator):
         if not ports.fault:
             message = self._staying.named or message or self._staying.unnamed
         solution = self._solution(ports, fit, message)  # now: a lesson moves the belief
-        # A crowded frame teaches nothing: other forces explain it as well as other wires do.
-        if ports.fault or message or prior.is_crowded(fit.log_cells):
+        # Soft fingertips teach nothing: other forces explain them as well as other wires do.
+        if ports.fault or message or prior.is_soft(fit.log_cells, self._shape):
             again = False
         else:
             again = self._belief.after_fit(fit, ports, again=again)
