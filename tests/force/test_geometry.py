@@ -130,8 +130,9 @@ def test_icub_s_files_are_read(tmp_path: Path) -> None:
     ("arrays", "reason"),
     [
         ('<array rows="12" cols="12" size="1 1"/>', "an <array> of 12x12 taxels, the skin has 2x3"),
-        ('<array rows="2" cols="3" size="1 1" order="col-major"/>', "row-major and"),
-        ('<array rows="2" cols="3" size="1 1" offset="0.1 0"/>', "without an offset"),
+        ('<array rows="2" cols="3" size="1 1" order="col-major"/>', "not one <array>, row-major"),
+        ('<array rows="2" cols="3" size="1 1" offset="1"/>', "offset='1' is not 2 numbers"),
+        ('<array rows="2" cols="3"/>', "size='' is not 2 numbers"),
         ('<array size="1 1"/><array size="2 2"/>', "not one <array>, row-major"),
     ],
 )
@@ -154,8 +155,32 @@ def test_urdf_is_read(tmp_path: Path) -> None:
     known = Geometry.of_file(path, 1, 2, "tip")
     assert known.position_m[0] == pytest.approx(np.array([[2, 0, 0], [1, 0, 0]]))
     assert known.normal[0] == pytest.approx(np.array([[0, 0, 1], [1, 0, 0]]), abs=1e-6)
+
+
+def test_a_urdf_array_has_x_along_rows(tmp_path: Path) -> None:
+    """It was read transposed. By urdf_tactile: x = row * spacing.x - offset.x, y of columns."""
+    path = tmp_path / "robot.urdf"
     path.write_text('<robot><array rows="2" cols="3" size="0.005 0.006"/></robot>')
-    assert Geometry.of_file(path, 2, 3, "tip").position_m[1, 2] == pytest.approx([0.01, 0.006, 0])
+    known = Geometry.of_file(path, 2, 3, "tip")
+    assert known.position_m[1, 2] == pytest.approx([0.005, 0.012, 0])
+    assert known.normal[1, 2] == pytest.approx([0, 0, 1])
+    grid = '<array rows="2" cols="3" size="9 9" spacing="0.02 0.03" offset="0.001 -0.002"/>'
+    path.write_text(f"<robot><sensor><tactile>{grid}</tactile></sensor></robot>")
+    known = Geometry.of_file(path, 2, 3, "tip")
+    assert known.position_m[0, 0] == pytest.approx([-0.001, 0.002, 0])
+    assert known.position_m[1, 2] == pytest.approx([0.019, 0.062, 0])
+
+
+@pytest.mark.parametrize("taxels", ['<taxel idx="0"/><taxel idx="1"/>', '<array size="1 1"/>'])
+def test_taxels_of_two_sensors_are_refused(tmp_path: Path, taxels: str) -> None:
+    """They were taken for those of one skin, in turn."""
+    path = tmp_path / "robot.urdf"
+    sensor = f"<sensor><tactile>{taxels}</tactile></sensor>"
+    path.write_text(f"<robot><sensor><camera/></sensor>{sensor}{sensor}</robot>")
+    with pytest.raises(ValueError, match="2 sensors with taxels: leave only this skin's"):
+        Geometry.of_file(path, 2, 2, "skin")
+    path.write_text(f"<robot><sensor><camera/></sensor>{sensor}</robot>")
+    assert Geometry.of_file(path, 1, 2, "skin").kind == "table"
 
 
 @pytest.mark.filterwarnings("error")

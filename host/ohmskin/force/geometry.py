@@ -127,13 +127,12 @@ class Geometry:
 
         Lines ``x y z nx ny nz`` [m], one a taxel, as for iCub's skin (other lines are passed over);
         or URDF, whose ``<array>`` or ``<taxel idx= xyz= rpy=>`` are those of the package
-        urdf_tactile. Raises ValueError, naming the file, if it says no rows x columns cells.
+        urdf_tactile, in the frame of their sensor: where the robot has it is not read. Raises
+        ValueError, naming the file, if it says no rows x columns cells of one sensor.
         """
         with naming(path):
             text = read_bounded(path, _MAX_FILE_BYTES).decode(errors="replace")
             told = _of_urdf(text, rows, columns) if "<" in text else _of_lines(text)
-            if "pitch_m" in told:
-                return cls("flat", frame_id, rows, columns, told)
             count = len(told["normal"])
             if count != rows * columns:
                 raise ValueError(f"{count} taxels, the skin has {rows}x{columns} cells")
@@ -158,23 +157,27 @@ def _of_urdf(text: str, rows: int, columns: int) -> dict[str, Float]:
     except ElementTree.ParseError as exc:
         raise ValueError(f"no XML: {exc}") from exc
 
-    def numbers(taxel: ElementTree.Element, name: str, count: int) -> Float:
-        found = np.array(taxel.get(name, "0 0 0").split(), dtype=np.float64)
+    def numbers(taxel: ElementTree.Element, name: str, count: int, absent: str = "0 0 0") -> Float:
+        found = np.array(taxel.get(name, absent).split(), dtype=np.float64)
         if found.size != count or not np.isfinite(found).all():
             raise ValueError(f"{name}='{taxel.get(name, '')[:40]}' is not {count} numbers")
         return found
 
+    of_skins = [s for s in tree.iter("sensor") if s.findall(".//array") or s.findall(".//taxel")]
+    if len(of_skins) > 1:
+        raise ValueError(f"{len(of_skins)} sensors with taxels: leave only this skin's in the file")
     if grids := tree.findall(".//array"):
         grid, size = grids[0], (str(rows), str(columns))
         if (of_grid := (grid.get("rows", size[0]), grid.get("cols", size[1]))) != size:
             skin = f"the skin has {rows}x{columns} cells"
             raise ValueError(f"an <array> of {'x'.join(of_grid)[:40]} taxels, {skin}")
-        is_plain = grid.get("order", "row-major") == "row-major"
-        if len(grids) > 1 or not is_plain or any(map(float, grid.get("offset", "0").split())):
-            raise ValueError(
-                "not one <array>, row-major and without an offset: leave no other in it"
-            )
-        return {"pitch_m": numbers(grid, "spacing" if grid.get("spacing") else "size", 2)}
+        if len(grids) > 1 or grid.get("order", "row-major") != "row-major":
+            raise ValueError("not one <array>, row-major: leave no other in it")
+        # urdf_tactile has x along rows: its taxel_info_iterator.cpp.
+        spacing_m = numbers(grid, "spacing" if grid.get("spacing") else "size", 2)
+        at_m = np.argwhere(np.ones((rows, columns))) * spacing_m
+        at_m -= numbers(grid, "offset", 2, "0 0")
+        return _table(np.column_stack([at_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(at_m), 1))]))
     taxels = []
     for taxel in sorted(tree.iter("taxel"), key=lambda taxel: int(taxel.get("idx", "0"))):
         (sr, sp, sy), (cr, cp, cy) = (f(numbers(taxel, "rpy", 3)) for f in (np.sin, np.cos))
