@@ -10,6 +10,7 @@ since it last asked.
 import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
+from dataclasses import replace
 from itertools import islice
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
@@ -45,6 +46,9 @@ class LiveSkin(Closing):
 
     A board that is not there, or goes away, is opened again and again. The latest tare stays, and
     so do the wires that were learned. (After a tare, a method learns them anew.)
+
+    Only the newest `QUEUE_SCANS` scans are kept. A recording that is played at speed 0 does not
+    wait for the program here: who needs all of a longer one iterates over `ohmskin.open`.
 
     port, calibration, force: as `ohmskin.open` takes them.
     every: whether every scan is estimated. False: only the newest, whenever the estimate before it
@@ -87,6 +91,7 @@ class LiveSkin(Closing):
         self._reader: SkinReader | None = None
         self._kept: deque[ForceScan] = deque(maxlen=QUEUE_SCANS)
         self._count = 0
+        self._sent = 0  # scans so far with those that were missed before them
         self._changed = threading.Condition()
         # A port that never answers does not hold up the end of the program.
         self._thread = threading.Thread(target=self._work, name=f"live {port}", daemon=True)
@@ -100,8 +105,6 @@ class LiveSkin(Closing):
     def since(self, count: int, timeout_s: float = 0.0) -> tuple[int, list[ForceScan]]:
         """The count to ask with next, and every scan after the first `count` scans, each once.
 
-        Only the newest `QUEUE_SCANS` scans are kept.
-
         timeout_s: how long to wait [s] if there is no such scan yet.
         """
         with self._changed:
@@ -110,13 +113,23 @@ class LiveSkin(Closing):
             return self._count, list(islice(self._kept, begin, None))
 
     def __iter__(self) -> Iterator[ForceScan]:
-        """Every scan from now on, until `close`; also after the board was away."""
-        return self._after(self._count)
+        """Every scan from now on, until `close`; also after the board was away.
 
-    def _after(self, count: int) -> Iterator[ForceScan]:
-        scans: list[ForceScan] = []
-        while scans or not self._is_over:
-            count, scans = self.since(count, SILENCE_TIMEOUT_S)
+        An iterator that falls behind by more than `QUEUE_SCANS` loses the oldest scans, which its
+        next one counts as missed.
+        """
+        with self._changed:
+            return self._after(self._count, self._sent)
+
+    def _after(self, count: int, sent: int) -> Iterator[ForceScan]:
+        is_over = False
+        while not is_over:
+            is_over = self._is_over  # asked first: what came before the end is given, too
+            with self._changed:
+                count, scans = self.since(count, SILENCE_TIMEOUT_S)
+                sent, before = self._sent, sent
+            if lost := sent - before - sum(1 + scan.missed for scan in scans):
+                scans[0] = replace(scans[0], missed=scans[0].missed + lost)
             yield from scans
 
     def __aiter__(self) -> AsyncIterator[ForceScan]:
@@ -213,6 +226,7 @@ class LiveSkin(Closing):
         with self._changed:
             self._kept.append(read)
             self._count += 1
+            self._sent += 1 + read.missed
 
     def _gone(self) -> None:
         """Is called when the board is not open any more."""

@@ -4,6 +4,7 @@
 import asyncio
 import threading
 import time
+from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from ohmskin.force.reader import SkinReader
 from ohmskin.link.messages import Scan
 from ohmskin.live import LiveSkin
 from ohmskin.record.recorder import Recorder
+from waiting import until
 
 URL = "emulator://8x8?scene=ghost&seed=1&begin=0"
 ENOUGH_S = 20.0  # a test waits so long for what comes at once, unless it never comes
@@ -153,6 +155,29 @@ def test_an_iterator_gives_the_last_scans_of_a_recording(
             time.sleep(0.01)
         found += scans
     assert len(found) == 20
+
+
+@pytest.mark.parametrize("first", ["before the end", "after it"])
+def test_an_iterator_counts_what_it_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: str
+) -> None:
+    """Scans that the buffer could not hold were gone, and none told; of an ended one, all were."""
+    monkeypatch.setattr(live, "QUEUE_SCANS", 16)
+    path = tmp_path / "a.mcap"
+    with ohmskin.open(URL) as board, Recorder(path, board.info) as recorder:
+        for scan in islice(board, 60):
+            recorder.add(replace(scan, missed=3 if scan.number == 20 else 0))
+    go_on = threading.Event()
+    monkeypatch.setattr(SkinReader, "warm_up", lambda reader: go_on.wait(ENOUGH_S))
+    with LiveSkin(f"replay://{path}?speed=0", of_scene("ghost")) as skin:
+        scans = iter(skin)
+        go_on.set()
+        found = [next(scans)] if first == "before the end" else []
+        until(lambda: skin.ended)
+        found += scans
+    assert len(found) >= 16
+    assert found[-1].number == scan.number
+    assert sum(1 + scan.missed for scan in found) == 63
 
 
 def test_close_ends_an_iterator_while_the_port_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
