@@ -19,7 +19,7 @@ from ohmskin import opening
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.files import Closing
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
-from ohmskin.link.device import LOG, QUEUE_SCANS, SILENCE_TIMEOUT_S, Device, in_threads
+from ohmskin.link.device import LOG, QUEUE_SCANS, SILENCE_TIMEOUT_S, Device, InThreads
 from ohmskin.link.messages import Hello, Scan
 
 if TYPE_CHECKING:
@@ -118,10 +118,14 @@ class LiveSkin(Closing):
         An iterator that falls behind by more than `QUEUE_SCANS` loses the oldest scans, which its
         next one counts as missed.
         """
+        return (scan for scan in self._from_now() if scan is not None)
+
+    def _from_now(self) -> Iterator[ForceScan | None]:
+        """The same, and None when no scan has come for `SILENCE_TIMEOUT_S`."""
         with self._changed:
             return self._after(self._count, self._sent)
 
-    def _after(self, count: int, sent: int) -> Iterator[ForceScan]:
+    def _after(self, count: int, sent: int) -> Iterator[ForceScan | None]:
         is_over = False
         while not is_over:
             is_over = self._is_over  # asked first: what came before the end is given, too
@@ -130,11 +134,11 @@ class LiveSkin(Closing):
                 sent, before = self._sent, sent
             if lost := sent - before - sum(1 + scan.missed for scan in scans):
                 scans[0] = replace(scans[0], missed=scans[0].missed + lost)
-            yield from scans
+            yield from scans or (None,)
 
     def __aiter__(self) -> AsyncIterator[ForceScan]:
         """The same for ``async for``."""
-        return in_threads(self)
+        return InThreads(self._from_now)
 
     def there(self) -> tuple[Device, SkinReader]:
         """The open board, and the reader of its skin, which knows the tares.

@@ -4,6 +4,7 @@
 import asyncio
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -84,6 +85,30 @@ def test_async_for_gives_every_scan() -> None:
 
     numbers = asyncio.run(read())
     assert numbers == list(range(numbers[0], numbers[0] + 10))
+
+
+def test_async_for_over_a_skin_that_is_not_there_can_be_given_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The thread that waited for a scan waited for ever, and so the program never ended."""
+    monkeypatch.setattr(live, "SILENCE_TIMEOUT_S", 0.05)
+
+    async def read() -> None:
+        async with asyncio.timeout(0.2):
+            async for _ in skin:
+                pass
+
+    def run() -> None:
+        with suppress(TimeoutError):
+            asyncio.run(read())
+
+    with LiveSkin("/dev/nothing", None) as skin:
+        program = threading.Thread(target=run)
+        program.start()
+        program.join(ENOUGH_S)
+        never_ended = program.is_alive()
+    program.join()
+    assert not never_ended
 
 
 def test_a_program_waits_for_what_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:

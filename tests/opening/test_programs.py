@@ -3,6 +3,7 @@
 
 import asyncio
 import re
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
@@ -83,6 +84,22 @@ def test_a_loop_goes_on_while_scans_are_waited_for(calibrated: bool) -> None:
     assert [each.number - scans[0].number for each in scans] == list(range(10))
     assert isinstance(scans[0], ohmskin.ForceScan) == calibrated
     assert turns > 10
+
+
+def test_who_stops_waiting_for_a_scan_is_given_it_next() -> None:
+    """A timeout ended the whole iteration, and the scan that came was lost."""
+
+    async def read() -> list[int]:
+        numbers: list[int] = []
+        with ohmskin.open("emulator://2x2?rate=20") as skin:
+            scans = aiter(skin)
+            while len(numbers) < 5:
+                with suppress(TimeoutError):
+                    numbers.append((await asyncio.wait_for(anext(scans), 0.001)).number)
+        return numbers
+
+    numbers = asyncio.run(read())
+    assert numbers == list(range(numbers[0], numbers[0] + 5))
 
 
 def test_async_ends_with_a_recording(tmp_path: Path) -> None:

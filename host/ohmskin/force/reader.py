@@ -32,7 +32,7 @@ from ohmskin.force.contacts import Contact, ContactTracker
 from ohmskin.force.focus import FOLLOWING, Focus
 from ohmskin.force.geometry import Geometry
 from ohmskin.link.codes import quantise
-from ohmskin.link.device import Device, Region, in_threads
+from ohmskin.link.device import Device, InThreads, Region
 from ohmskin.link.messages import BoardStats, Hello, Scan
 from ohmskin.link.protocol import MODES
 
@@ -467,7 +467,7 @@ class CalibratedSkin(Closing):
 
     def __aiter__(self) -> AsyncIterator[ForceScan]:
         """The same for ``async for``."""
-        return in_threads(self)
+        return InThreads(self.__iter__)
 
     def latest(self, timeout_s: float | None = None) -> ForceScan:
         """The newest scan, with its forces."""

@@ -9,7 +9,8 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Final, Self, TypeVar
+from itertools import islice
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -19,6 +20,9 @@ from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.files import Closing
 from ohmskin.link import protocol
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
+
+if TYPE_CHECKING:
+    from asyncio import Future
 
 # What a program may want in its log: restarts and boards that go are warnings, missed scans infos.
 LOG = logging.getLogger("ohmskin")
@@ -149,7 +153,7 @@ class Device(Closing):
 
     def __aiter__(self) -> AsyncIterator[Scan]:
         """The same as iterating, for ``async for``."""
-        return in_threads(self)
+        return InThreads(self.__iter__)
 
     def __iter__(self) -> Iterator[Scan]:
         """Every scan from now on; ``missed`` of each counts what was lost before it.
@@ -452,13 +456,38 @@ def configuration(board: Hello) -> dict[str, protocol.Value]:
     return asked | {name: getattr(board, name) for name in same}
 
 
-async def in_threads(skin: Iterable[_S]) -> AsyncIterator[_S]:
-    """The scans of a skin for ``async for``: threads wait for them, and the event loop goes on."""
-    from asyncio import to_thread  # only these programs need it
+class InThreads(AsyncIterator[_S]):
+    """The scans of a skin for ``async for``: threads wait for them, and the event loop goes on.
 
-    scans = await to_thread(iter, skin)
-    while (scan := await to_thread(next, scans, None)) is not None:
-        yield scan
+    Whoever stops waiting, as by a timeout, loses nothing: the scan that comes is given next.
+
+    begin: begins to iterate. What it gives may be None where a thread has waited for long: if
+        nobody waits for it any more, it then ends, and does not hold up the end of the program.
+    """
+
+    def __init__(self, begin: Callable[[], Iterator[_S | None]]) -> None:
+        self._begin = begin
+        self._scans: Iterator[_S | None] | None = None
+        self._taking: Future[list[_S | None]] | None = None
+
+    async def __anext__(self) -> _S:
+        from asyncio import ensure_future, shield, to_thread  # only these programs need it
+
+        while True:
+            if self._taking is None:
+                self._taking = ensure_future(to_thread(self._take))
+            taken = await shield(self._taking)
+            if not taken:
+                raise StopAsyncIteration
+            self._taking = None
+            if taken[0] is not None:
+                return taken[0]
+
+    def _take(self) -> list[_S | None]:
+        """The next one, as a list; it is empty at the end."""
+        if self._scans is None:
+            self._scans = self._begin()
+        return list(islice(self._scans, 1))
 
 
 def scans_for(scans: Iterable[Scan], seconds: float) -> Iterator[Scan]:
