@@ -14,7 +14,7 @@ import pytest
 import ohmskin
 from calibrations import of_scene
 from command_line import Run, assert_one_line, well
-from ohmskin.errors import OhmskinError
+from ohmskin.errors import OhmskinError, RecordingError
 from ohmskin.force.reader import ForceScan
 from ohmskin.force.tables import export, load_forces
 from ohmskin.record.readings import load_readings
@@ -109,6 +109,32 @@ def test_a_part_of_it(recorded: Path) -> None:
     arrays = load_forces(recorded, of_scene("ghost"), 0.1, 0.2)
     assert arrays["number"].tolist() == list(range(9, 18))
     assert arrays["force_n"].shape == (9, 8, 8)
+
+
+def test_a_part_has_its_own_marks(recorded: Path) -> None:
+    """It had those of the whole recording."""
+    known = of_scene("ghost")
+    of_parts = [(0.0, 0.05), (0.1, 0.2), (0.2, 0.0)]
+    found = [load_forces(recorded, known, *part)["mark_text"].tolist() for part in of_parts]
+    assert found == [[], ["here"], ["end"]]
+
+
+def test_another_unit_in_a_recording_needs_its_own_calibration(tmp_path: Path) -> None:
+    """Its forces were read by the first unit's calibration, and its own was refused."""
+    path, first, other = tmp_path / "a.mcap", stepped(URL), stepped(f"{URL}&unit=5")
+    with Recorder(path, first.info) as recorder:
+        for scan in islice(first, 10):
+            recorder.add(scan)
+        recorder.add(other.info)
+        for scan in islice(other, 10):
+            recorder.add(replace(scan, host_time_s=scan.host_time_s + 1.0))
+    with pytest.raises(RecordingError, match="unit 5 has come in place of unit 0: export each par"):
+        load_forces(path, of_scene("ghost"))
+    assert len(load_forces(path, of_scene("ghost"), end_s=0.5)["number"]) == 10
+    of_other = replace(of_scene("ghost"), unit_id=5)
+    assert len(load_forces(path, of_other, begin_s=0.5)["number"]) == 10
+    with pytest.raises(ValueError, match="of unit 0, the board is unit 5"):
+        load_forces(path, of_scene("ghost"), begin_s=0.5)
 
 
 def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: Run) -> None:

@@ -513,6 +513,23 @@ def test_export_of_a_part(tmp_path: Path, recorded: Path) -> None:
     assert not list(tmp_path.glob("b*"))
 
 
+def test_a_part_has_the_tare_that_held_and_the_board_that_was_there(
+    path: Path, hello: Hello, tmp_path: Path
+) -> None:
+    """The file had a tare from after the part, and the references of a board before it."""
+    rests = [np.full((3, 4, 4), rest) for rest in (0.2, 0.3)]
+    other = replace(hello, ref_top_ohm=10_000)
+    messages_in_order = (
+        *(scan(0, at_s=0.0), Tare(rests[0], 0.5), other, scan(1, at_s=1.0)),
+        *(Tare(rests[1], 1.5), scan(2, at_s=2.0)),
+    )
+    write_recording(path, hello, messages_in_order)
+    export(path, tmp_path / "a.npz", begin_s=0.9, end_s=1.1)
+    readings = load_readings(tmp_path / "a.npz")
+    np.testing.assert_array_equal(readings.rest_ratio, rests[0])
+    assert readings.ref_top_ohm == 10_000
+
+
 def test_cells_that_no_scan_has_read_are_exported_as_such(
     tmp_path: Path, path: Path, hello: Hello
 ) -> None:

@@ -53,7 +53,7 @@ def load_forces(
 
     end_s = 0: to the last scan. An hour of 8x8 at 90 Hz takes 200 MB; `export` needs less memory.
 
-    :raises RecordingError: the recording cannot be read.
+    :raises RecordingError: the recording cannot be read, or the part has scans of another unit.
     :raises ValueError: the calibration is of another unit, size or mode.
     """
     part = Part(path, begin_s, end_s, timed=True)
@@ -99,7 +99,11 @@ def read_forces(part: Part, calibration: Calibration) -> Iterator[ForceScan]:
     """The scans of a part of a recording with their forces, each with the tare before it."""
     reader: SkinReader | None = None
     for scan in part:
-        reader = reader or SkinReader(part.boards[0], calibration)
+        board = part.boards[-1]
+        reader = reader or SkinReader(board, calibration)
+        if board.unit_id != reader.board.unit_id:
+            came = f"unit {board.unit_id} has come in place of unit {reader.board.unit_id}"
+            raise part.error(f"{came}: export each part by its own calibration")
         tare = part.tare_of(scan)
         yield reader.read(scan if tare is None else replace(scan, rest_ratio=tare.rest_ratio))
 

@@ -96,9 +96,10 @@ class Part:
     begin_s, end_s: the part's first and last moment [s after the first scan]; 0: of the recording.
     scans: how many scans there were.
     cut_off: whether the recording was not ended properly, so that its last second may be missing.
-    boards: the first that the board says of itself, as a list of one.
+    boards: what the board had said of itself at the part's first scan, and then at each scan before
+        which it said something new.
     tares: all that were read.
-    marks: all that were read.
+    marks: those of the part.
     timed, watch: as `messages` takes them.
 
     :raises RecordingError: as `messages`; there are no scans, or they have not all the same size.
@@ -116,30 +117,37 @@ class Part:
     watch: Callable[[int], object] | None = None
 
     def __iter__(self) -> Iterator[Scan]:
-        self.scans, size, first = 0, None, None
+        self.scans, size, first_s = 0, None, math.inf
         for of_file in (self.boards, self.tares, self.marks):
             of_file.clear()
         for message in messages(self.path, timed=self.timed, watch=self.watch):
             self.cut_off = message is not None
             match message:
-                case Hello() if not self.boards:
-                    self.boards.append(message)
+                case Hello():
+                    board = message
                 case Tare():
                     self.tares.append(message)
-                case Mark():
+                case Mark() if self._holds(message.host_time_s - first_s):
                     self.marks.append(message)
                 case Scan():
-                    first = first or message
-                    after_s = message.host_time_s - first.host_time_s
-                    if (self.begin_s or after_s) <= after_s <= (self.end_s or after_s):
-                        size = size or message.codes.shape[:2]
-                        if message.codes.shape[:2] != size:
-                            change = f"the cells change after {after_s:.3f} s"
-                            raise self.error(f"{change}: export each part by itself")
-                        self.scans += 1
-                        yield message
+                    first_s = message.host_time_s if first_s == math.inf else first_s
+                    after_s = message.host_time_s - first_s
+                    if not self._holds(after_s):
+                        continue
+                    size = size or message.codes.shape[:2]
+                    if message.codes.shape[:2] != size:
+                        change = f"the cells change after {after_s:.3f} s"
+                        raise self.error(f"{change}: export each part by itself")
+                    if self.boards[-1:] != [board]:
+                        self.boards.append(board)
+                    self.scans += 1
+                    yield message
         if not self.scans:
             raise RecordingError(f"{self.path}: no scans, neither in it nor in this part of it")
+
+    def _holds(self, after_s: float) -> bool:
+        """Whether this is a moment of the part [s after the first scan]."""
+        return (self.begin_s or after_s) <= after_s <= (self.end_s or after_s)
 
     def tare_of(self, scan: Scan) -> Tare | None:
         """The newest tare so far that is good for this scan; None if there is none."""
@@ -191,7 +199,7 @@ def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArr
 def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
     """Write a readings file that also has the arrays of `_OF_SCAN`.
 
-    Its `rest_ratio` is the last tare that is good for the last scan.
+    Its `rest_ratio` is the last tare before the last scan that is good for it.
     """
     scans = iter(part)
     first = next(scans)
@@ -208,7 +216,8 @@ def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
                 raise part.error(f"{many}: export a part of them")
             ratio = _of_names(scan, scan.ratio, names)
             stacks.add({"ratio": ratio, **{name: getattr(scan, name) for name in _OF_SCAN}})
-        board, tare = part.boards[0], part.tare_of(scan)
+            tare = part.tare_of(scan)  # now: tares that come after the part are read, too
+        board = part.boards[0]
         more = {
             "reading_names": names,
             "ref_top_ohm": float(board.ref_top_ohm),
