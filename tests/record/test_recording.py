@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -564,6 +564,16 @@ def test_a_recording_goes_on_in_the_background_of_a_shell(path: Path) -> None:
     done = python("-c", spawn, *shell, "record", URL, path, "--scans", "60", TERM="dumb")
     assert f"{path}: 60 scans, missed 0" in done.out
     assert done.code == 0
+
+
+def test_true_forces_of_a_board_that_is_reset_stay_in_order(path: Path, run: Run) -> None:
+    """After the reset, scans and forces had times from before it."""
+    url = "emulator://2x3?speed=0&rate=20&reset=2"
+    well(run("record", url, str(path), "--scans", "100", "--force-port", "truth"))
+    recorded = load_recording(path)
+    assert any(b.time_us < a.time_us for a, b in pairwise(recorded.scans))
+    assert all(a.host_time_s < b.host_time_s for a, b in pairwise(recorded.scans))
+    assert all(a.host_time_s < b.host_time_s for a, b in pairwise(recorded.forces))
 
 
 def test_the_commands(tmp_path: Path, command: Command, run: Run) -> None:

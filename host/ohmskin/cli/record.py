@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin record``, ``export`` and ``estimate``: scans in files."""
 
+import math
 import os
 import signal
 import sys
@@ -143,11 +144,13 @@ def with_truth(scans: Iterable[Scan], skin: Device, recorder: Recorder) -> Itera
     Scans and forces get their times from the board's clock, because a scan may arrive late, and the
     board of a simulator may be slower than the host's clock.
     """
-    begin_s: float | None = None  # of the board's clock, by the host's
+    begin_s, before_s = 0.0, math.inf  # of the board's clock, by the host's; the scan before
     assert skin.true_force_n is not None
     for scan in scans:
         board_s = 1e-6 * scan.time_us
-        begin_s = scan.host_time_s - board_s if begin_s is None else begin_s
+        if board_s < before_s:  # the first scan, or the board was reset and counts anew
+            begin_s = scan.host_time_s - board_s
+        before_s = board_s
         force_n = float(skin.true_force_n(scan).sum())
         recorder.add(ForceSample(force_n, begin_s + board_s, source=TRUTH))
         yield replace(scan, host_time_s=begin_s + board_s)
