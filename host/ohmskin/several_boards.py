@@ -7,6 +7,7 @@ import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from os import PathLike
 from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 
 from ohmskin import opening
@@ -112,7 +113,11 @@ def open_all(
     :raises DeviceSilent: as `ohmskin.open`, for a port that was named.
     :raises ProtocolMismatch: as `ohmskin.open`.
     :raises ValueError: as `ohmskin.open`; a board has no calibration, or two are of one unit.
+    :raises TypeError: one URL or one file in place of a list of them.
     """
+    for name, given in (("urls", urls), ("calibrations", calibrations)):
+        if isinstance(given, str | PathLike):
+            raise TypeError(f"open_all takes a list of {name}, and got one: put {given!r} into []")
     searches = urls is None
     ports = [port.path for port in serial_ports() if port.board] if urls is None else list(urls)
     if not ports:

@@ -46,6 +46,15 @@ def test_boards_are_named_by_their_skins_and_closed_together() -> None:
     skins.close()
 
 
+@pytest.mark.parametrize("one", ["emulator://8x8", Path("skin.json")])
+def test_one_in_place_of_a_list_is_refused(one: str | Path) -> None:
+    """Each letter was opened as a port."""
+    with pytest.raises(TypeError, match="takes a list of urls, and got one: put "):
+        ohmskin.open_all(one)
+    with pytest.raises(TypeError, match="takes a list of calibrations, and got one"):
+        ohmskin.open_all(units(1), calibrations=one)
+
+
 def test_they_need_not_start() -> None:
     with ohmskin.open_all(units(1, 2), start=False) as skins:
         time.sleep(0.1)
