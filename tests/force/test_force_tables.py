@@ -165,9 +165,13 @@ def test_a_format_that_the_file_has_not_is_refused(
     recorded: Path, tmp_path: Path, run: Run
 ) -> None:
     words = ("export", str(recorded), str(tmp_path / "out.npz"), "--format")
-    assert_one_line(run(*words, ".csv"), "--format .csv is of files in a folder")
+    for kind in (".csv", "csv"):
+        assert_one_line(run(*words, kind), "--format .csv is of files in a folder")
     assert not (tmp_path / "out.npz").exists()
     well(run(*words, ".npz"))
+    (tmp_path / "folder").mkdir()
+    well(run("export", str(recorded), str(tmp_path / "folder"), "--format", "csv"))
+    assert (tmp_path / "folder" / "a.csv").exists()
 
 
 def test_without_dask_it_says_what_to_install(

@@ -242,6 +242,7 @@ def export(
     Recordings that go into a folder are read by all cores at once. .parquet needs pyarrow.
     """
     known = None if calibration is None else load_calibration(calibration)
+    kind = kind and f".{kind.removeprefix('.')}"
     is_folder, name_end = out.is_dir(), kind or ".npz"
     if not is_folder and kind not in ("", out.suffix):
         raise ValueError(f"--format {kind} is of files in a folder, and {out} is none")
