@@ -48,7 +48,7 @@ def test_it_takes_a_file_of_taxels(file: Path, run: Run, tmp_path: Path) -> None
     assert load_calibration(file).geometry.position_m[1, 0, 0] == pytest.approx(0.08)
 
 
-@pytest.mark.parametrize("pitch", ["10", "a,b", "1,2,3"])
+@pytest.mark.parametrize("pitch", ["10", "a,b", "1,2,3", ".,1", "1.2.3,1"])
 def test_a_pitch_is_two_numbers(file: Path, run: Run, pitch: str) -> None:
     done = run("skin", str(file), "--pitch-mm", pitch)
     assert (done.code, done.out) == (2, "")
@@ -62,6 +62,7 @@ def test_a_pitch_is_two_numbers(file: Path, run: Run, pitch: str) -> None:
         (("--picture", "p.svg"), "nobody has said where the cells are: say --pitch-mm"),
         (("--pitch-mm", "10,10", "--picture", "/no/such/p.svg"), "/no/such/p.svg: cannot"),
         (("--pitch-mm", "0,10"), "two numbers above 0, not '0,10'"),
+        (("--pitch-mm", "10,10", "--radius-mm", "5"), "8 columns of 0.01 m go round more than"),
         (("--pitch-mm", "10,10", "--taxels", "taxels.txt"), "either --taxels, or --pitch-mm"),
     ],
 )

@@ -46,6 +46,12 @@ def test_a_cylinder_s_columns_go_round_y(tmp_path: Path) -> None:
     assert known.normal[3, 5] == pytest.approx([np.sin(angle), 0, np.cos(angle)])
 
 
+def test_columns_may_go_round_once(tmp_path: Path) -> None:
+    """A sleeve is closed: the first column follows the last, a pitch away or nearly so."""
+    known = geometry(tmp_path / "skin.json", {**CYLINDER, "radius_m": 0.0127})
+    assert np.linalg.norm(known.position_m[0, 7] - known.position_m[0, 0]) > 0.009
+
+
 def test_it_is_kept(tmp_path: Path) -> None:
     table = {
         "kind": "table",
@@ -71,6 +77,7 @@ def test_it_is_kept(tmp_path: Path) -> None:
         ({**FLAT, "frame_id": "a\x1b[2J"}, "frame_id must be a name"),
         ({**CYLINDER, "radius_m": 0}, "radius_m is not above 0"),
         ({**CYLINDER, "radius_m": 5e-324}, "radius_m is not above 0"),
+        ({**CYLINDER, "radius_m": 0.011}, "8 columns of 0.01 m go round more than once"),
         ({**FLAT, "kind": "table"}, "no field 'geometry.normal'"),
         ([], "geometry holds list"),
     ],

@@ -4,7 +4,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 from typer import Argument, Option
@@ -14,6 +14,8 @@ from ohmskin.cli.picture import picture
 from ohmskin.files import check_place
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.geometry import Geometry
+
+_NUMBER: Final = r"(\d+\.?\d*|\.\d+)"
 
 
 def skin(
@@ -40,7 +42,7 @@ def skin(
     if taxels is not None:
         placed = Geometry.of_file(taxels, known.rows, known.columns, frame)
     elif pitch_mm or radius_mm:
-        if not re.fullmatch(r"[\d.]+,[\d.]+", pitch_mm):
+        if not re.fullmatch(f"{_NUMBER},{_NUMBER}", pitch_mm):
             raise ValueError(f"--pitch-mm wants two numbers, as 10,10, not '{pitch_mm}'")
         told = {"pitch_m": 1e-3 * np.array([float(mm) for mm in pitch_mm.split(",")])}
         if not told["pitch_m"].all():

@@ -97,6 +97,9 @@ class Geometry:
         radius_m = self.told["radius_m"]
         if not radius_m >= _LEAST_RADIUS_M:
             raise ValueError(f"radius_m is not above {_LEAST_RADIUS_M:g}")
+        if np.ptp(x) >= 2 * np.pi * radius_m:
+            around = f"{self.columns} columns of {across_m:g} m go round more than once"
+            raise ValueError(f"radius_m is {radius_m:g}: {around}: a larger radius, or less pitch")
         normal = np.stack([np.sin(x / radius_m), zero, np.cos(x / radius_m)], -1)
         return radius_m * normal + np.stack([zero, y, zero], -1), normal
 
