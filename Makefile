@@ -99,7 +99,7 @@ wheel: firmware pico ## build dist/ohmskin-*.whl with the firmware of all boards
 	rm -r $(HEX)
 
 test-firmware: setup ## unit tests of the firmware: on this machine and in simulated AVRs
-	$(BIN)/pio test -e native -e uno_sim -e mega_sim
+	$(BIN)/pio test -e native -e native_pico -e uno_sim -e mega_sim
 
 test-arduino-gcc: setup sim ## test the firmware as built with avr-gcc 7.3, which Arduino's users have
 	$(ONE_THREAD) tools/test_arduino_gcc.sh

@@ -146,7 +146,10 @@ class Planner {
             return line_limits ? Result::LineTooSlow : Result::TooFast;
         if (settle != 0) {
             // Slots as short as they may be: the scan is over early, and its readings are close
-            // together.
+            // together. But no shorter than that 16 bits count them.
+            const uint16_t counted = static_cast<uint16_t>((period >> 16) + 1);
+            if (slot_min < counted)
+                slot_min = counted;
             divide(period, static_cast<uint16_t>(period / slot_min), -1, least, slot_min, &plan);
         } else {
             // Slots as long as they may be.
