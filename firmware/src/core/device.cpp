@@ -15,7 +15,10 @@ using frames::Type;
 void Device::begin() {
     baud_ = frames::BAUD_DEFAULT;
     baud_confirmed_ = true;
-    settings_source_ = load_settings(&settings_, cycles_per_byte());
+    // What was saved at the faster line is kept, be it too fast for this one. Then `hello` says how
+    // the board would scan at that line, and start() is refused at this one.
+    const uint16_t fast = board::cycles_per_byte(frames::BAUD_FAST);
+    settings_source_ = load_settings(&settings_, fast, &next_);
     plan(settings_.request, &next_);
     hello_pending_ = attention_ = true;
 }

@@ -123,7 +123,7 @@ Settings default_settings() {
     return settings;
 }
 
-frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte) {
+frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte, Routes *routes) {
     *settings = default_settings();
     Record record;
     if (read_newest(&record) == NOWHERE && !read(OLD_AT, &record))
@@ -132,9 +132,8 @@ frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte) {
     const ScanRequest request = {
         record.rows,     record.columns,   record.accuracy, record.row_mask,   record.column_mask,
         record.rate_mhz, record.settle_us, record.mode,     record.whole_mode, record.whole_every};
-    Routes routes;
     uint32_t rate_mhz;
-    if (plan_scan(request, cycles_per_byte, &routes, &rate_mhz) != frames::Result::Ok)
+    if (plan_scan(request, cycles_per_byte, routes, &rate_mhz) != frames::Result::Ok)
         return frames::Settings::DefaultsDamaged;
     settings->request = request;
     return frames::Settings::Stored;

@@ -41,8 +41,9 @@ static_assert(sizeof(SettingsRecord) == 29, "no padding; a change needs a new VE
 
 // Loads settings from EEPROM. Without a sound record of this version it yields the defaults. Where
 // this firmware cannot make the record's scan with this line, the unit id stays and the scan is the
-// default. The result says which.
-OHMSKIN_RARE frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte);
+// default. The result says which. `routes` changes only where the scan is the record's: its plan.
+OHMSKIN_RARE frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte,
+                                            Routes *routes);
 
 // Writes settings to EEPROM one byte at a time without waiting, so that the scan goes on. A reset
 // at any moment leaves the old settings or the new ones.

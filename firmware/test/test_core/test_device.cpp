@@ -402,6 +402,27 @@ TEST(settings_survive_a_restart_and_damage_is_named) {
     }
 }
 
+TEST(what_was_saved_at_the_faster_line_survives_a_restart) {
+    Bench &bench = fresh();
+    const frames::SetBaud fast = {frames::BAUD_FAST};
+    const frames::Configure quick = scan_request(2, 2, 1200000);
+    CHECK_EQ(Result::LineTooSlow, bench.host.answer_to(Type::Configure, &quick, sizeof quick));
+    bench.host.answer_to(Type::SetBaud, &fast, sizeof fast);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &quick, sizeof quick));
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Save));
+    bench.host.rewind();
+    const frames::Hello before = bench.host.hello();
+    bench.boot();
+    frames::Hello after = bench.host.hello();
+    CHECK_EQ(frames::Settings::Stored, static_cast<frames::Settings>(after.settings));
+    CHECK_EQ(2, after.rows);
+    CHECK_EQ(1200000, after.rate_asked_mhz);
+    CHECK_EQ(before.scan_cycles, after.scan_cycles);
+    CHECK_EQ(Result::LineTooSlow, bench.host.answer_to(Type::Start));
+    bench.host.answer_to(Type::SetBaud, &fast, sizeof fast);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
+}
+
 TEST(load_defaults_keeps_the_eeprom) {
     Bench &bench = fresh();
     const frames::Configure size = scan_request(5, 7, 60000);

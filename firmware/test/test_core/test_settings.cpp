@@ -52,7 +52,8 @@ bool same(const Settings &a, const Settings &b) {
 
 OHMSKIN_APART Settings loaded(Source *source = nullptr) {
     Settings settings;
-    const Source from = load_settings(&settings, 320);
+    Routes routes;
+    const Source from = load_settings(&settings, 320, &routes);
     if (source)
         *source = from;
     return settings;
