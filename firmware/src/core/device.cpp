@@ -130,20 +130,23 @@ void Device::send_pending() {
 // Changes the line's speed, and changes it back if the host is not heard at the new one: the host
 // or its USB bridge may not know that speed, and could never reach the board again.
 void Device::watch_baud() {
-    if (baud_next_ != 0) {
+    const bool asked = baud_next_ != 0;
+    if (asked) {
         if (ack_count_ != 0 || writer_.has_byte() || !board::serial_idle())
             return;  // the ack of set_baud still leaves at the old speed
         baud_ = baud_next_;
         baud_next_ = 0;
-        board::serial_speed(baud_);
-        baud_changed_us_ = board::now_us();
-        baud_confirmed_ = false;
-    } else if (!baud_confirmed_ &&
-               board::now_us() - baud_changed_us_ > frames::BAUD_CONFIRM_MS * 1000UL) {
+    } else {
+        if (baud_confirmed_ ||
+            board::now_us() - baud_changed_us_ <= frames::BAUD_CONFIRM_MS * 1000UL)
+            return;
         baud_ = frames::BAUD_DEFAULT;
-        board::serial_speed(baud_);
-        baud_confirmed_ = true;
     }
+    board::serial_speed(baud_);
+    baud_changed_us_ = board::now_us();
+    baud_confirmed_ = !asked;
+    // Where the request is too fast for this line, the plan for the faster one stays: see begin().
+    plan(settings_.request, &next_);
 }
 
 // ---------------------------------------------------------------------------------- commands

@@ -458,6 +458,33 @@ TEST(an_unconfirmed_speed_falls_back) {
     CHECK_EQ(frames::BAUD_FAST, fake::state.baud);
 }
 
+TEST(hello_says_the_rate_that_the_line_of_now_carries) {
+    Bench &bench = fresh();
+    const frames::Configure fastest = scan_request(2, 2, 0, 1);  // as fast as the line carries it
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &fastest, sizeof fastest));
+    bench.host.rewind();
+    const uint32_t slow = bench.host.hello().scan_cycles;
+    const frames::SetBaud fast = {frames::BAUD_FAST};
+    bench.host.answer_to(Type::SetBaud, &fast, sizeof fast);
+    bench.host.rewind();
+    const uint32_t quick = bench.host.hello().scan_cycles;
+    CHECK(quick < slow);
+    bench.host.answer_to(Type::Start);
+    bench.slots(200, ramp);
+    bench.host.rewind();
+    CHECK_EQ(quick, bench.host.hello().scan_cycles);
+    bench.host.send(Type::Stop);
+    bench.slots(200, ramp);
+    bench.host.rewind();
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::SetBaud, &fast, sizeof fast));
+    fake::state.now_us += frames::BAUD_CONFIRM_MS * 1000UL + 1;
+    bench.host.work();
+    bench.host.rewind();
+    const frames::Hello after = bench.host.hello();
+    CHECK_EQ(frames::BAUD_DEFAULT, after.baud);
+    CHECK_EQ(slow, after.scan_cycles);
+}
+
 namespace {
 // The codes of A to D, which in mode near are pattern entries 0 to 3.
 const uint16_t *nodes;
