@@ -215,7 +215,9 @@ Result Device::refusal() const {
         return Result::UnknownCommand;
     if (reader_.payload_size() != size)
         return Result::BadLength;
-    if (activity_ == Activity::SelfTesting && command != Type::GetHello)
+    // While the line's speed waits for its change, a scan would be planned for the old one, and
+    // would fill the ring, so that the change never came.
+    if ((activity_ == Activity::SelfTesting || baud_next_ != 0) && command != Type::GetHello)
         return Result::Busy;
     const bool scanning = activity_ == Activity::Scanning || activity_ == Activity::Stopping;
     if (scanning && tears_scan(command))

@@ -458,6 +458,25 @@ TEST(an_unconfirmed_speed_falls_back) {
     CHECK_EQ(frames::BAUD_FAST, fake::state.baud);
 }
 
+TEST(no_scan_starts_while_the_line_waits_for_its_new_speed) {
+    Bench &bench = fresh();
+    const frames::Configure size = scan_request(2, 2, 90000);
+    const frames::SetBaud fast = {frames::BAUD_FAST};
+    fake::state.line_stuck = true;  // the answer to set_baud cannot leave yet
+    bench.host.send(Type::SetBaud, &fast, sizeof fast);
+    bench.host.send(Type::Configure, &size, sizeof size);
+    bench.host.send(Type::Start);
+    CHECK_EQ(0, fake::state.baud);
+    fake::state.line_stuck = false;
+    bench.host.work();
+    CHECK_EQ(frames::BAUD_FAST, fake::state.baud);
+    CHECK_EQ(Result::Ok, bench.host.answer(Type::SetBaud));
+    CHECK_EQ(Result::Busy, bench.host.answer(Type::Configure));
+    CHECK_EQ(Result::Busy, bench.host.answer(Type::Start));
+    CHECK(!fake::state.slots_running);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
+}
+
 TEST(hello_says_the_rate_that_the_line_of_now_carries) {
     Bench &bench = fresh();
     const frames::Configure fastest = scan_request(2, 2, 0, 1);  // as fast as the line carries it
