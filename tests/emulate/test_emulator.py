@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import ohmskin
+from firmware_helpers import go_fast
 from lockstep import CPU_HZ, Rig
 from ohmskin.emulate import board as emulator
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
@@ -330,6 +331,41 @@ def test_emulator_and_firmware_answer_alike(board: str) -> None:
             answers = [answer(rig, frame_type, payload) for rig in (real, model)]
             assert answers[0] == answers[1] != "ok", (frame_type, payload)
         both_in_every_state(real, model)
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize("board", ["uno", "emulator"])
+def test_the_speed_of_the_line_decides_which_scans_can_be(board: str) -> None:
+    with rig_of(board) as rig:
+        quick = DEFAULT | {"rows": 2, "columns": 2, "rate_mhz": 1_200_000}
+        assert rig.command("configure", **quick) == "line_too_slow"
+        rig.must("configure", **(quick | {"rate_mhz": 0, "settle_us": 1}))
+        slow = hello_of(rig).rate_hz
+        go_fast(rig)
+        assert hello_of(rig).rate_hz > 1.2 * slow
+        rig.must("configure", **quick)
+        rig.must("save")
+        rig.run(0.3)
+        (rig.sim if board == "uno" else rig.sim.board).reset()
+        rig.run(0.02)
+        hello = hello_of(rig)
+        assert (hello.settings, hello.rows, hello.baud) == ("stored", 2, 500_000)
+        assert hello.rate_hz == pytest.approx(1200, rel=0.002)
+        assert rig.command("start") == "line_too_slow"
+        go_fast(rig)
+        rig.must("start")
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize("board", ["uno", "emulator"])
+def test_a_start_right_behind_set_baud_is_refused(board: str) -> None:
+    with rig_of(board) as rig:
+        rig.sim.write(rig.encode("set_baud", baud=1_000_000) + rig.encode("start"))
+        rig.run(0.02)
+        assert [ack["result"] for ack in rig.frames("ack")] == ["ok", "busy"]
+        hello = hello_of(rig)
+        assert (hello.baud, hello.scanning) == (1_000_000, 0)
+        rig.must("start")
 
 
 REGION: dict[str, protocol.Value] = {

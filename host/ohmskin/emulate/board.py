@@ -148,7 +148,10 @@ class EmulatedBoard:
         self._reset_cause = cause
         self.boot_s = self.now_s
         self._baud = _CONSTANTS["baud_default"]
-        self._plans = self._next_plans = _scan_plans(self.settings, self._baud)
+        self._next_baud: int | None = None  # it comes when the answer to set_baud has left
+        # A scan that was saved at the faster line is kept, and refused at start: as the firmware.
+        self._plans = self._next_plans = _scan_plans(self.settings, _CONSTANTS["baud_fast"])
+        self._plan_again()
         self._sequence = 0
         self._rate_mhz = 0  # what the answer to the present command says
         self._scan = 0
@@ -183,6 +186,9 @@ class EmulatedBoard:
             self._send_scan(end - self._period_s)
         self.now_s = max(self.now_s, now_s)
         sent, self._out = bytes(self._out), bytearray()
+        if self._next_baud is not None:
+            self._baud, self._next_baud = self._next_baud, None
+            self._plan_again()
         return sent
 
     def heard(self, faults: LineFaults, now_s: float) -> bytes:
@@ -222,6 +228,8 @@ class EmulatedBoard:
 
     def _execute(self, name: str, values: dict[str, Any]) -> str:
         scanning = self._started_s is not None
+        if self._next_baud is not None and name != "get_hello":
+            return "busy"
         if scanning and name in ("configure", "load_defaults", "self_test", "set_baud"):
             return "scanning"
         match name:
@@ -230,6 +238,8 @@ class EmulatedBoard:
             case "configure" | "set_region":
                 return self._configure(self.settings | values)
             case "start" if not scanning:
+                if (refusal := self._plan_again()) is not None:
+                    return refusal
                 self._started_s, self._scan, self._first = self.now_s, 0, 0
                 self._until_whole = 0
                 self._take_turn()
@@ -248,8 +258,19 @@ class EmulatedBoard:
             case "set_baud":
                 if values["baud"] not in (_CONSTANTS["baud_default"], _CONSTANTS["baud_fast"]):
                     return "bad_baud"
-                self._baud = values["baud"]
+                self._next_baud = values["baud"]
         return "ok"
+
+    def _plan_again(self) -> str | None:
+        """Plan for the line's speed of now; the reason if the scan is too fast for it.
+
+        Then the plan for the faster line stays.
+        """
+        try:
+            self._plans = self._next_plans = _scan_plans(self.settings, self._baud)
+        except _Refused as refusal:
+            return refusal.result
+        return None
 
     def _configure(self, wanted: dict[str, Any]) -> str:
         """Use these settings from the next scan on. If they cannot be, nothing changes.
