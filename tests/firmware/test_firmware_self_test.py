@@ -91,6 +91,17 @@ def test_self_test_finds_a_node_at_a_rail(
         assert findings_on(rig, swapped(ratio)) == (f"bottom_stuck_{name}",)
 
 
+def test_a_self_test_ends_though_no_conversion_ends_in_time(rig: Rig) -> None:
+    rig.sim.set(late_cycles=900)
+    rig.must("self_test", limit_s=2.0)
+    report = rig.frames("self_test_report")[-1]
+    assert report["findings"] == ()
+    assert all(a > b for a, b in zip(report["code_min"], report["code_max"], strict=True))
+    rig.sim.set(late_cycles=0)
+    rig.must("self_test", limit_s=1.0)
+    assert rig.frames("self_test_report")[-1]["code_min"][0] < 1023
+
+
 A, B, C, D, E, F, G, H = range(8)
 
 

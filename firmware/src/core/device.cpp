@@ -35,10 +35,12 @@ bool Device::poll() {
         return true;
     }
     // Where no conversion ends in time, no group comes; the scans are counted before their number
-    // wraps.
+    // wraps, and the self-test ends with its second scan.
     if (activity_ == Activity::Scanning &&
         static_cast<uint8_t>(board::scanner.scans() - scan_number_) > Scanner::SCAN_NUMBERS / 2)
         count_silent_scans();
+    else if (activity_ == Activity::SelfTesting && board::scanner.scans() > 1)
+        board::scanner.stop_after_scan();
     // Codes cannot wait, because the queue is short. Everything else can.
     if (attention_ || board::scanner.parked())
         worked |= attend();

@@ -569,6 +569,22 @@ TEST(self_test_judges_no_reading_that_it_has_not_taken) {
     CHECK(report.code_min[2] > report.code_max[2]);
 }
 
+TEST(a_self_test_ends_though_no_conversion_ends_in_time) {
+    Bench &bench = fresh();
+    const frames::Configure far = scan_request(8, 8, 0, 0, 0, 1);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Configure, &far, sizeof far));
+    bench.host.rewind();
+    bench.host.send(Type::SelfTest);
+    bench.slots(3 * 2 * 1024 + 20, ramp, 0);  // two scans of each pattern
+    frames::SelfTestReport report;
+    if (!self_test_of(bench, &report))
+        return;
+    CHECK_EQ(0, report.findings);
+    for (uint8_t i = 0; i < frames::READINGS; i++)
+        CHECK(report.code_min[i] > report.code_max[i]);
+    CHECK_EQ(Result::Ok, bench.host.answer_to(Type::Start));
+}
+
 TEST(scans_that_never_fit_the_line_are_refused) {
     Bench &bench = fresh();
     // 16x16 in a burst of 27 ms needs 50 kB/s and more ring than there is at half that speed; at
