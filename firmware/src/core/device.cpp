@@ -118,10 +118,14 @@ void Device::send_pending() {
             acks_[still_waiting++] = ack;
             continue;
         }
+        // What was refused for another reason was not planned: then the rate is that of an earlier
+        // request.
+        const bool planned = ack.result == Result::Ok || ack.result == Result::TooFast ||
+                             ack.result == Result::LineTooSlow;
         const bool asks = ack.command == static_cast<uint8_t>(Type::Configure) ||
                           ack.command == static_cast<uint8_t>(Type::SetRegion);
         const frames::Ack frame = {ack.command, ack.sequence, static_cast<uint8_t>(ack.result),
-                                   ack.time_us, asks ? rate_mhz_ : 0};
+                                   ack.time_us, asks && planned ? rate_mhz_ : 0};
         writer_.begin(Type::Ack);
         writer_.put(&frame, sizeof frame);
         writer_.end();

@@ -87,10 +87,12 @@ class Host {
         while (next(&frame))
             if (frame.type == static_cast<uint8_t>(Type::Ack)) {
                 CHECK_EQ(static_cast<uint8_t>(type), frame.payload[0]);
+                memcpy(&last_ack, frame.payload, sizeof last_ack);
                 return static_cast<Result>(frame.payload[2]);
             }
         return static_cast<Result>(0xEE);
     }
+    frames::Ack last_ack;  // of answer()
 
     OHMSKIN_APART frames::Hello hello() {
         send(Type::GetHello);
@@ -248,6 +250,23 @@ TEST(configure_changes_all_or_nothing) {
     CHECK_EQ(Result::UnknownCommand, host.answer_to(static_cast<Type>(0xA0)));
     host.rewind();
     CHECK(same(before, host.hello()));
+}
+
+TEST(an_answer_says_the_rate_of_its_own_request_or_none) {
+    Bench &bench = fresh();
+    Host &host = bench.host;
+    const frames::Configure slow = scan_request(4, 4, 20000),
+                            too_fast = scan_request(16, 16, 90000);
+    CHECK_EQ(Result::Ok, host.answer_to(Type::Configure, &slow, sizeof slow));
+    CHECK(host.last_ack.rate_mhz > 19990 && host.last_ack.rate_mhz < 20010);
+    CHECK_EQ(Result::BadLength, host.answer_to(Type::Configure, &slow, sizeof slow - 1));
+    CHECK_EQ(0, host.last_ack.rate_mhz);
+    CHECK_EQ(Result::TooFast, host.answer_to(Type::Configure, &too_fast, sizeof too_fast));
+    CHECK(host.last_ack.rate_mhz > 20000 && host.last_ack.rate_mhz < 90000);
+    CHECK_EQ(Result::Ok, host.answer_to(Type::Start));
+    CHECK_EQ(0, host.last_ack.rate_mhz);
+    CHECK_EQ(Result::Scanning, host.answer_to(Type::Configure, &too_fast, sizeof too_fast));
+    CHECK_EQ(0, host.last_ack.rate_mhz);
 }
 
 TEST(a_scan_frame_holds_every_code_in_order) {
