@@ -142,7 +142,15 @@ bool serial_read(uint8_t *octet) {
 
 uint8_t eeprom_read(uint16_t address) { return EEPROM.read(address); }
 void eeprom_write(uint16_t address, uint8_t octet) { EEPROM.write(address, octet); }
-bool eeprom_busy() { return false; }
+// A write takes milliseconds, for which the next one would wait, and slots with it. Other boards
+// have no such register.
+bool eeprom_busy() {
+#if defined(EECR) && defined(EEPE)
+    return EECR & _BV(EEPE);
+#else
+    return false;
+#endif
+}
 
 }  // namespace board
 }  // namespace ohmskin

@@ -75,6 +75,18 @@ def test_its_self_test_reads_all_that_it_judges(rig: Rig) -> None:
         assert report["code_max"][:readings] == (1023, 0) * (readings // 2)
 
 
+def test_a_save_while_scanning_loses_no_scan(rig: Rig) -> None:
+    """Each byte of it waited for the byte before, 3.4 ms, and so did the slots."""
+    rig.start_scan(rate_mhz=20_000, rows=4, columns=4)
+    for unit_id in (0x12345678, 0x23456789):
+        rig.must("set_unit_id", unit_id=unit_id)
+        rig.must("save", limit_s=2)
+        rig.run(0.2)
+    rig.must("stop")
+    assert_whole(rig)
+    assert len(rig.scans) >= 8
+
+
 def test_settings_last(rig: Rig) -> None:
     rig.must("set_unit_id", unit_id=77)
     rig.must("save")
