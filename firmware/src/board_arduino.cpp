@@ -34,7 +34,23 @@ constexpr uint16_t LATE_US = 1000;
 constexpr uint16_t SETTLE_US = 20;
 // Bytes for the line in a pass of the main loop. Chosen: a scan brings 1.3 a slot.
 constexpr uint8_t BYTES_A_PASS = 2;
-constexpr uint8_t ANALOG_PINS[] = {A0, A1, A2, A3, A4, A5};
+// Pins of the analog inputs, from input 0 on. No more than are in use by default: not each board
+// has more, and an ESP32 has no A1 and no A2.
+#ifndef OHMSKIN_ANALOG_PINS
+#define OHMSKIN_ANALOG_PINS A0, A1, A2, A3
+#endif
+constexpr uint8_t ANALOG_PINS[] = {OHMSKIN_ANALOG_PINS};
+constexpr bool inputs_exist(uint8_t count) {
+    return count == 0 ||
+           (wiring::SENSE_INPUTS[count - 1] < sizeof ANALOG_PINS && inputs_exist(count - 1));
+}
+static_assert(inputs_exist(4), "OHMSKIN_SENSE_INPUTS: OHMSKIN_ANALOG_PINS has no such input");
+constexpr bool none_drives(uint8_t count) {
+    return count == 0 || (wiring::count(wiring::PINS, wiring::PIN_COUNT,
+                                        ANALOG_PINS[wiring::SENSE_INPUTS[count - 1]]) == 0 &&
+                          none_drives(count - 1));
+}
+static_assert(none_drives(4), "a pin drives and senses");
 
 bool slots_run, converted_before, pins_are_set;  // the last: for the slot at hand
 uint16_t slot_cycles, code_before;

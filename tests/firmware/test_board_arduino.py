@@ -2,12 +2,14 @@
 """The board by Arduino's own calls, built for an Uno: slow, but what it sends is right."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from firmware_helpers import CYCLES_PER_US, assert_whole
 from lockstep import DEFAULT_SCAN, LockstepSim, Rig, elf_of
+from pin_maps import build
 
 pytestmark = [
     pytest.mark.simavr,
@@ -85,6 +87,22 @@ def test_a_save_while_scanning_loses_no_scan(rig: Rig) -> None:
     rig.must("stop")
     assert_whole(rig)
     assert len(rig.scans) >= 8
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        ("-DOHMSKIN_SENSE_INPUTS=0,1,2,4", "OHMSKIN_ANALOG_PINS has no such input"),
+        ("-DOHMSKIN_DRIVE_TOP_PIN=16", "a pin drives and senses"),
+        ("-DOHMSKIN_SENSE_INPUTS=0,1,2,4 -DOHMSKIN_ANALOG_PINS=A0,A1,A2,A3,A4", ""),
+    ],
+)
+def test_a_wiring_that_cannot_be_does_not_compile(flags: str, why: str, tmp_path: Path) -> None:
+    if why:
+        with pytest.raises(RuntimeError, match=f"static assertion failed: .*{why}"):
+            build("uno_arduino", flags, tmp_path)
+    else:
+        build("uno_arduino", flags, tmp_path)
 
 
 def test_settings_last(rig: Rig) -> None:
