@@ -249,6 +249,7 @@ uint8_t reset_cause_bits;
 // Timer 0 is the clock: a count takes 64 clock cycles, and the counter turns over after 256 counts.
 constexpr uint8_t COUNT_US = 4;
 constexpr uint16_t TURN_US = 1024;
+static_assert(CLOCK_HZ == 16000000, "another clock has other times of a count and of a turn");
 uint32_t turns_us;  // time of all turns so far
 
 // What the firmware before this start left (core/reset_cause.h), and what the boot loader passes

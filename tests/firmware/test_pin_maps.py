@@ -199,6 +199,18 @@ def test_a_wiring_that_cannot_be_does_not_compile(
     assert re.search(f"(static assertion failed:|#error) .*{why}", done.stderr)
 
 
+def test_an_avr_with_another_clock_does_not_compile(tmp_path: Path) -> None:
+    """Its microseconds would be of another length."""
+    source = ROOT / "firmware" / "src" / "board_avr.cpp"
+    command = ["avr-g++", "-std=gnu++11", "-O2", "-mmcu=atmega328p", "-fsyntax-only", str(source)]
+    include = [f"-I{ROOT / 'firmware' / 'src'}", f"-I{ROOT / 'protocol'}"]
+    for clock_hz, code in ("16000000", 0), ("8000000", 1):
+        flag = f"-DF_CPU={clock_hz}UL"
+        done = subprocess.run([*command, *include, flag], capture_output=True, text=True)
+        assert done.returncode == code, done.stderr
+        assert ("another clock has other times" in done.stderr) == (code == 1)
+
+
 def test_the_default_wiring_is_that_of_the_table(tmp_path: Path) -> None:
     """What docs/build.md shows, by flags, in the simulators without a wiring of their own."""
     elf = build("uno", DEFAULT["uno"].flags, tmp_path)
