@@ -185,7 +185,7 @@ struct __attribute__((packed)) Scan {
     uint32_t scan;  // number of the scan since start, dropped ones counted; wraps
     uint32_t time_us;  // [us] board time at which the scan started; wraps
     uint16_t dropped;  // scans made but not sent since start; wraps
-    uint16_t rx_errors;  // damaged or overlong frames the board has received since boot; wraps
+    uint16_t rx_errors;  // damaged or overlong frames the board has received since boot, and commands that came while four others waited for their answers; wraps
     uint8_t rows;  // rows of the skin
     uint8_t columns;  // columns of the skin
     uint8_t mode;  // which readings these are
@@ -197,7 +197,7 @@ struct __attribute__((packed)) Scan {
 };
 static_assert(sizeof(Scan) == 26, "wire size");
 
-// board to host: answer to one command; the only one, sent when the command has been carried out
+// board to host: answer to one command; the only one, sent when the command has been carried out. A command that comes while four others wait for their answers is neither carried out nor answered, but counted in `rx_errors`
 struct __attribute__((packed)) Ack {
     uint8_t command;  // type of the command answered
     uint8_t command_sequence;  // sequence number of the command answered

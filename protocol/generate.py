@@ -124,7 +124,7 @@ def page() -> str:
     for frame in FRAMES.values():
         sender = "board to host" if frame.sender == "board" else "host to board"
         out += ["", f"### `{frame.name}` (0x{frame.id:02X}, {sender})", ""]
-        out += [" ".join(frame.doc.split()) + ".", ""]
+        out += [" ".join(frame.doc.split()).rstrip(".") + ".", ""]
         out.append(f"Payload: {_size(frame)}.")
         if frame.fields:
             out += ["", "| offset | field | type | unit | meaning |", "|---|---|---|---|---|"]

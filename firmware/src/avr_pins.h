@@ -25,7 +25,7 @@ constexpr char ANALOG_PORT = 'C';
 constexpr uint8_t ALL_PINS = sizeof PORTS - 1;
 static_assert(sizeof PORTS == sizeof BITS, "one bit a pin");
 
-// From pin `n` on, bits of a port whose pins are in a list.
+// A pin's bit in its port; that where the port is this one, else 0; those of a list of pins.
 constexpr uint8_t bit(uint8_t pin) { return static_cast<uint8_t>(1 << (BITS[pin] - '0')); }
 constexpr uint8_t bit_in(char port, uint8_t pin) { return PORTS[pin] == port ? bit(pin) : 0; }
 constexpr uint8_t bits_of(char port, const uint8_t *list, uint8_t size) {

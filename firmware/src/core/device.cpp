@@ -200,6 +200,7 @@ template <class Fields> Fields fields_of(const uint8_t *payload) {
 }  // namespace
 
 // Every command that arrives whole is answered once: refused at once, or when it is carried out.
+// But while ACKS_MAX answers wait, a further one is neither carried out nor answered.
 void Device::execute() {
     baud_confirmed_ = true;  // the host is heard at this speed
     if (ack_count_ == ACKS_MAX) {

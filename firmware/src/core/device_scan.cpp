@@ -48,8 +48,8 @@ void Device::take_group() {
 void Device::begin_scan() {
     if (codes_left_ != 0)
         drop_open_scan();  // its last codes were lost
-    // Answers first, if they find room: before the line's time is spent on a new scan.
     account_for_lost_scans(board::scanner.scan_number());
+    // Answers first, if they find room: before the line's time is spent on a new scan.
     if (answers_wait())
         send_pending();
     const Route &now = route();
