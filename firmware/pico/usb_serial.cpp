@@ -47,6 +47,13 @@ struct Endpoint {
             asm volatile("nop\n nop\n nop");
         at(buffer_control()) = control | AVAILABLE;
     }
+    // The next packet is DATA0, be it the one that the controller has already.
+    void begin_again() {
+        pid = 0;
+        const uint32_t control = at(buffer_control());
+        if (armed && (control & AVAILABLE))
+            arm(control & (FULL | LENGTH));
+    }
     uint8_t length() const { return static_cast<uint8_t>(at(buffer_control()) & LENGTH); }
     void reset() {
         pid = 0;
@@ -164,7 +171,9 @@ void carry_out() {
         return acknowledge();
     case 0x0201:  // CLEAR_FEATURE of an endpoint: its packets begin with DATA0 again
         if (setup.value == ENDPOINT_HALT && setup.index == DATA_IN)
-            data_in.pid = 0;
+            data_in.begin_again();
+        if (setup.value == ENDPOINT_HALT && setup.index == DATA_OUT)
+            data_out.begin_again();
         return acknowledge();
     case 0x2122:  // SET_CONTROL_LINE_STATE
         port_open = setup.value & DTR;

@@ -75,6 +75,12 @@ class UsbHost {
         });
     }
 
+    // Both ends begin with DATA0 again, as where a driver clears a halt of the endpoint `address`.
+    clearHalt(address) {
+        const offset = this.endpoints[address & 0x80 ? "in" : "out"];
+        this.transfer(request(2, 1, 0, address, 0), null, () => this.toggles.set(offset, 0));
+    }
+
     // ---- enumeration, and the port's opening
     enumerate() {
         const found = this.descriptors;

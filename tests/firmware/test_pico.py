@@ -124,6 +124,19 @@ def test_usb_keeps_to_the_rules(rig: Rig) -> None:
     assert stats["usb_packets"] > 20
 
 
+@pytest.mark.parametrize("endpoint", [0x02, 0x82])
+def test_after_a_cleared_halt_packets_begin_with_data0(rig: Rig, endpoint: int) -> None:
+    """A controller throws a packet away that is not the one it waits for."""
+    assert isinstance(rig.sim, PicoSim)
+    for _ in range(3):  # with an even number of packets before, and with an odd one
+        rig.hello()
+        rig.sim.clear_halt(endpoint)
+        rig.run(0.005)
+        rig.hello()
+    stats = rig.sim.stats()
+    assert stats["wrong_toggles"] == stats["stalls"] == 0
+
+
 def test_a_port_that_nobody_reads_stops_no_scan(rig: Rig) -> None:
     assert isinstance(rig.sim, PicoSim)
     rig.start_scan()

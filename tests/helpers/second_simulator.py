@@ -53,6 +53,10 @@ class PicoSim(LockstepSim):
         """Let a program of the host open the port, or close it."""
         self.request("U", struct.pack("<?", is_open))
 
+    def clear_halt(self, endpoint: int) -> None:
+        """Clear an endpoint's halt, as a driver does: its packets begin with DATA0 again."""
+        self.request("H", bytes([endpoint]))
+
     def described(self) -> dict[str, bytes]:
         """The descriptors that the board has given: device, configuration, serial_number."""
         said: dict[str, Any] = json.loads(self.request("V"))
