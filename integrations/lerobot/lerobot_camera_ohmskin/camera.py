@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from lerobot.cameras.camera import Camera
 from lerobot.cameras.configs import CameraConfig
+from lerobot.utils.errors import DeviceAlreadyConnectedError
 from numpy.typing import NDArray
 
 import ohmskin
@@ -37,6 +38,14 @@ class OhmskinCameraConfig(CameraConfig):
         self.width = self.width or 16 * known.columns
 
 
+def _now_s(skin: ohmskin.LiveSkin) -> float:
+    """Now, by the clock of `Scan.host_time_s` [s]: that of the day may be set at any time."""
+    try:
+        return skin.there()[0].now_s
+    except ohmskin.DeviceLost:
+        return time.monotonic()
+
+
 class OhmskinCamera(Camera):
     """See `OhmskinCameraConfig`. A board that is unplugged and plugged again goes on."""
 
@@ -62,6 +71,10 @@ class OhmskinCamera(Camera):
 
     def connect(self, warmup: bool = True) -> None:
         """Open the port, and wait for the first scan."""
+        if self.skin is not None:
+            said = f"{self.config.port} is connected already: call disconnect() first"
+            raise DeviceAlreadyConnectedError(said)
+        self._count = 0  # a new skin counts from 0
         self.skin = ohmskin.LiveSkin(self.config.port, self.config.calibration)
         try:
             if warmup:
@@ -99,8 +112,9 @@ class OhmskinCamera(Camera):
 
     def read_latest(self, max_age_ms: int = 500) -> NDArray[np.uint8]:
         """The newest image, at once. Raises TimeoutError if it is older than that."""
-        newest = self._open().newest()
-        if newest is None or 1e-6 * (time.time_ns() - newest.time_ns) > max_age_ms:
+        skin = self._open()
+        newest = skin.newest()
+        if newest is None or 1e3 * (_now_s(skin) - newest.host_time_s) > max_age_ms:
             raise TimeoutError(f"{self.config.port}: no scan of the last {max_age_ms} ms")
         return self._image(newest)
 

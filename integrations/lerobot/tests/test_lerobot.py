@@ -12,6 +12,7 @@ import pytest
 import still  # noqa: F401  (registers a robot of this name)
 from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.robots import Robot, make_robot_from_config
+from lerobot.utils.errors import DeviceAlreadyConnectedError
 from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
 
 import ohmskin
@@ -53,6 +54,54 @@ def test_lerobot_makes_the_camera_by_its_type(skin_json: str) -> None:
     red = image[8::16, 8::16, 0]
     assert red == pytest.approx(np.clip(51 * force_n, 0, 255), abs=2)
     assert set(zip(*np.nonzero(red > 5), strict=True)) == {(2, 2), (2, 5), (5, 2)}
+
+
+def test_a_camera_that_is_connected_again_has_its_first_scan_at_once(skin_json: str) -> None:
+    """It waited for as many scans as it had given before."""
+    config = OhmskinCameraConfig(port=URL, calibration=skin_json)
+    camera = make_cameras_from_configs({"tip": config})["tip"]
+    camera.connect()
+    while camera.skin.since(0)[0] < 50:
+        camera.async_read(10_000)
+    camera.disconnect()
+    camera.connect(warmup=False)
+    count, scans = camera.skin.since(0, 20.0)
+    camera.async_read(0)  # of what is there already
+    camera.disconnect()
+    assert scans
+    assert count < 50
+
+
+def test_a_camera_is_connected_once(skin_json: str) -> None:
+    """A second skin took the port from the first, whose thread nobody could end."""
+    config = OhmskinCameraConfig(port=URL, calibration=skin_json)
+    camera = make_cameras_from_configs({"tip": config})["tip"]
+    camera.connect()
+    first = camera.skin
+    with pytest.raises(DeviceAlreadyConnectedError, match="call disconnect"):
+        camera.connect()
+    assert camera.skin is first
+    camera.disconnect()
+
+
+@pytest.mark.parametrize("set_by_s", [-3600, 3600])
+def test_the_age_of_an_image_is_right_when_the_clock_of_the_day_is_set(
+    skin_json: str, monkeypatch: pytest.MonkeyPatch, set_by_s: float
+) -> None:
+    config = OhmskinCameraConfig(port=f"{URL}&vanish=2", calibration=skin_json)
+    camera = make_cameras_from_configs({"tip": config})["tip"]
+    camera.connect()
+    now_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns() + round(1e9 * set_by_s))
+    camera.async_read(20_000)
+    camera.read_latest(10_000)
+    monkeypatch.setattr(live, "AGAIN_S", 60.0)
+    while camera.skin.failure is None:
+        time.sleep(0.1)
+    time.sleep(0.3)
+    with pytest.raises(TimeoutError, match="no scan of the last 250 ms"):
+        camera.read_latest(250)
+    camera.disconnect()
 
 
 def wrapped(skin_json: str, tmp_path: Path, url: str = URL) -> Robot:
