@@ -18,11 +18,13 @@ from lerobot_camera_ohmskin.robot import SCANS
 
 def windows(
     arrays: dict[str, NDArray[Any]], episode: NDArray[Any], timestamp_s: NDArray[Any]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
     """Forces (frames, `SCANS`, R, C) [N] and scan numbers (frames, `SCANS`) of a dataset's frames.
 
-    A frame has the scans since the frame before it, the oldest first, then zeros and -1. arrays: of
-    `ohmskin.load_forces`. episode, timestamp_s: of each frame, as datasets have them.
+    A frame has the scans since the frame before it, the oldest first, then zeros and -1. If they
+    are more than `SCANS`, it has the newest, and the others are counted: how many found no place.
+
+    arrays: of `ohmskin.load_forces`. episode, timestamp_s: of each frame, as datasets have them.
 
     :raises ValueError: there are not as many marks as episodes.
     """
@@ -39,17 +41,21 @@ def windows(
     starts_ns = np.concatenate([ends_ns[:1], ends_ns[:-1]])
     starts_ns[first] = ends_ns[first] - frame_ns
     ends = np.searchsorted(arrays["time_ns"], ends_ns, side="right")
-    starts = np.maximum(np.searchsorted(arrays["time_ns"], starts_ns, side="right"), ends - SCANS)
+    of_frame = np.searchsorted(arrays["time_ns"], starts_ns, side="right")
+    starts = np.maximum(of_frame, ends - SCANS)
     force_n = np.zeros((ends.size, SCANS, *arrays["force_n"].shape[1:]), np.float32)
     numbers = np.full((ends.size, SCANS), -1, np.float32)
     for frame, (begin, end) in enumerate(zip(starts, ends, strict=True)):
         force_n[frame, : end - begin] = np.nan_to_num(arrays["force_n"][begin:end])
         numbers[frame, : end - begin] = arrays["number"][begin:end]
-    return force_n, numbers
+    return force_n, numbers, int((starts - of_frame).sum())
 
 
-def merge(root: Path, recording: Path, calibration: str, name: str, out: Path) -> None:
-    """Write the dataset at `root` to `out`, with the features NAME.force and NAME.number."""
+def merge(root: Path, recording: Path, calibration: str, name: str, out: Path) -> int:
+    """Write the dataset at `root` to `out`, with the features NAME.force and NAME.number.
+
+    Returns how many scans found no place (`windows`).
+    """
     from lerobot.datasets.dataset_tools import add_features
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -57,15 +63,16 @@ def merge(root: Path, recording: Path, calibration: str, name: str, out: Path) -
     frames = dataset.hf_dataset.with_format("numpy")
     arrays = ohmskin.load_forces(recording, ohmskin.load_calibration(calibration))
     episode, time_s = (np.asarray(frames[key][:]) for key in ("episode_index", "timestamp"))
-    told = zip(("force", "number"), windows(arrays, episode, time_s), strict=True)
+    *told, lost = windows(arrays, episode, time_s)
     features = {
         f"observation.{name}.{kind}": (
             values,
             {"dtype": "float32", "shape": list(values.shape[1:]), "names": None},
         )
-        for kind, values in told
+        for kind, values in zip(("force", "number"), told, strict=True)
     }
     add_features(dataset, features, output_dir=out, repo_id=out.name)
+    return lost
 
 
 def main() -> None:
@@ -79,7 +86,8 @@ def main() -> None:
     parser.add_argument("--name", default="skin", help="observation.NAME.force")
     told = parser.parse_args()
     try:
-        merge(told.dataset, told.recording, told.calibration, told.name, told.out)
+        lost = merge(told.dataset, told.recording, told.calibration, told.name, told.out)
+        print(f"{told.out}: {lost} scans found no place, as a frame has places for {SCANS}")
     except (ohmskin.OhmskinError, ValueError, OSError) as exc:
         raise SystemExit(f"ohmskin-lerobot: {exc}") from exc
 

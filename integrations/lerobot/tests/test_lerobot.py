@@ -209,7 +209,8 @@ def recorded(tmp_path: Path) -> Path:
 def test_windows_are_those_of_the_frames(recorded: Path, skin_json: str) -> None:
     arrays = ohmskin.load_forces(recorded, ohmskin.load_calibration(skin_json))
     episode, time_s = np.repeat([0, 1], 30), np.tile(np.arange(30) / 30, 2)
-    force_n, numbers = windows(arrays, episode, time_s)
+    force_n, numbers, lost = windows(arrays, episode, time_s)
+    assert lost == 0
     assert force_n.shape == (60, SCANS, 8, 8)
     assert np.isfinite(force_n).all()
     for frames in (numbers[:30], numbers[30:]):
@@ -221,6 +222,15 @@ def test_windows_are_those_of_the_frames(recorded: Path, skin_json: str) -> None
     np.testing.assert_array_equal(force_n[5, 0], arrays["force_n"][at])
     with pytest.raises(ValueError, match="2 marks that begin with 'episode', the dataset has 3"):
         windows(arrays, np.array([0, 1, 2]), np.zeros(3))
+
+
+def test_scans_that_find_no_place_are_counted(recorded: Path, skin_json: str) -> None:
+    """18 scans come from one frame to the next at 5 Hz; it took the newest, and said nothing."""
+    arrays = ohmskin.load_forces(recorded, ohmskin.load_calibration(skin_json))
+    episode, time_s = np.repeat([0, 1], 5), np.tile(np.arange(5) / 5, 2)
+    _, numbers, lost = windows(arrays, episode, time_s)
+    assert (numbers >= 0).all()
+    assert lost == pytest.approx(10 * (18 - SCANS), abs=2)
 
 
 def test_a_recording_becomes_a_feature(recorded: Path, skin_json: str, tmp_path: Path) -> None:
@@ -238,7 +248,7 @@ def test_a_recording_becomes_a_feature(recorded: Path, skin_json: str, tmp_path:
             dataset.add_frame({"observation.state": row, "action": row, "task": "hold"})
         dataset.save_episode()
     dataset.finalize()
-    merge(tmp_path / "local", recorded, skin_json, "tip", tmp_path / "touch")
+    assert merge(tmp_path / "local", recorded, skin_json, "tip", tmp_path / "touch") == 0
     merged = LeRobotDataset("touch", root=tmp_path / "touch")
     assert merged[7]["observation.tip.force"].shape == (SCANS, 8, 8)
     assert float(merged[7]["observation.tip.force"].max()) > 0.5
