@@ -11,14 +11,16 @@ ARGUMENTS = {"port": "/dev/ttyACM0", "calibration": "skin.json", "frame_id": "",
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The node, with its parameters as arguments."""
+    """The node, with its name and its parameters as arguments."""
     told = {name: LaunchConfiguration(name) for name in ARGUMENTS}
+    name = LaunchConfiguration("name")
     return LaunchDescription(
         [
             *(
                 DeclareLaunchArgument(name, default_value=usual)
                 for name, usual in ARGUMENTS.items()
             ),
-            Node(package="ohmskin_ros", executable="skin", name="ohmskin", parameters=[told]),
+            DeclareLaunchArgument("name", default_value="ohmskin"),
+            Node(package="ohmskin_ros", executable="skin", name=name, parameters=[told]),
         ]
     )

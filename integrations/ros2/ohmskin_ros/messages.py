@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of ROS 2 from a scan."""
 
+import time
 from array import array
 
 import numpy as np
@@ -16,6 +17,16 @@ FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "force", "force_std
 def header(scan: ohmskin.ForceScan, frame_id: str) -> Header:
     """The time of the scan's middle, and the frame."""
     return Header(stamp=Time(nanoseconds=scan.time_ns).to_msg(), frame_id=frame_id)
+
+
+def stamp_off_s(scan: ohmskin.ForceScan) -> float:
+    """How much later the clock of the day is than that of the scan's stamp [s].
+
+    The stamp is by the clock of the day as it was when the port was opened. A recording that is
+    played has the stamps that it was made with.
+    """
+    came_s = 1e-9 * time.time_ns() - (time.monotonic() - scan.host_time_s)
+    return came_s - 1e-9 * scan.time_ns
 
 
 def point_cloud(scan: ohmskin.ForceScan, head: Header) -> PointCloud2:

@@ -19,7 +19,8 @@ from contextlib import suppress
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.executors import ExternalShutdownException
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, PointCloud2
@@ -29,11 +30,14 @@ import ohmskin
 from ohmskin.cli.doctor_words import verdict, words_of
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.gather import gather
-from ohmskin_ros.messages import header, image, point_cloud
+from ohmskin_ros.messages import header, image, point_cloud, stamp_off_s
 
 # Diagnostics warn where more than this share of the last second's scans was not published. Chosen:
 # a pause of a busy machine now and then is no fault.
 SKIPPED_SHARE = 0.1
+# They warn, too, where stamps are so far from the clock of the day [s]. Chosen: no line delays a
+# scan for so long, and what other nodes saw at the same moment is no longer found by its stamp.
+STAMP_OFF_S = 0.5
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -54,8 +58,10 @@ class SkinNode(Node):
         self._points = self.create_publisher(PointCloud2, "~/points", QOS)
         self._image = self.create_publisher(Image, "~/image", QOS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_service(Trigger, "~/tare", self._tare)
-        self.create_service(Trigger, "~/examine", self._examine)
+        # They take seconds, in which diagnostics go on; one at a time, as each needs the board.
+        slow = MutuallyExclusiveCallbackGroup()
+        self.create_service(Trigger, "~/tare", self._tare, callback_group=slow)
+        self.create_service(Trigger, "~/examine", self._examine, callback_group=slow)
         self.create_timer(1.0, self._diagnose)
         self.missed = self.published = 0
         self._before = 0, 0  # published and skipped, at the last diagnosis
@@ -100,7 +106,7 @@ class SkinNode(Node):
         said = [(each.kind.id, words_of(each)) for each in diagnosis.findings]
         self._doctor = DiagnosticStatus(
             level=DiagnosticStatus.OK if diagnosis.sound else DiagnosticStatus.WARN,
-            name="ohmskin: doctor",
+            name=f"{self.get_name()}: doctor",
             message=answer.message,
             hardware_id=self.skin.port,
             values=[
@@ -111,12 +117,19 @@ class SkinNode(Node):
         return answer
 
     def _diagnose(self) -> None:
-        failure, newest = self.skin.failure, self.skin.newest()
+        failure: Exception | str | None = self.skin.failure
+        newest = self.skin.newest()
+        if failure is None and not self._thread.is_alive():
+            failure = "nothing is published any more (the terminal says why): start the node again"
         level, said = DiagnosticStatus.OK, "scanning"
         if failure is not None or newest is None:
             level, said = DiagnosticStatus.ERROR, str(failure or "no scan yet")
         elif newest.estimate.message:
             level, said = DiagnosticStatus.WARN, newest.estimate.message
+        elif abs(off_s := stamp_off_s(newest)) > STAMP_OFF_S:
+            what = f"stamps and the clock of this machine are {abs(off_s):.1f} s apart"
+            why = "it was set after the port was opened (start the node again)"
+            level, said = DiagnosticStatus.WARN, f"{what}: {why}, or the port is a recording"
         state = str(failure or ("is being opened" if newest is None else "scans come"))
         if state != self._state and failure is None:
             self.get_logger().info(f"{self.skin.port}: {state}")
@@ -138,8 +151,9 @@ class SkinNode(Node):
             "times the port was opened": self.skin.opened,
         }
         values = [KeyValue(key=key, value=str(count)) for key, count in counts.items()]
+        name, port = self.get_name(), self.skin.port
         status = DiagnosticStatus(
-            level=level, name="ohmskin", message=said, hardware_id=self.skin.port, values=values
+            level=level, name=name, message=said, hardware_id=port, values=values
         )
         array = DiagnosticArray(status=[status, *filter(None, [self._doctor])])
         array.header.stamp = self.get_clock().now().to_msg()
@@ -162,7 +176,7 @@ def main() -> None:
         raise SystemExit(f"ohmskin_ros: {exc}") from exc
     try:
         with suppress(KeyboardInterrupt, ExternalShutdownException):
-            rclpy.spin(node)
+            rclpy.spin(node, MultiThreadedExecutor(num_threads=2))
     finally:
         node.close()
         rclpy.try_shutdown()

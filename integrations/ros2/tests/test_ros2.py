@@ -49,9 +49,10 @@ def skin_json(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def node(skin_json: Path) -> Iterator[Callable[[str], subprocess.Popen]]:
     started = []
 
-    def start(url: str) -> subprocess.Popen:
+    def start(url: str, name: str = "ohmskin") -> subprocess.Popen:
         parameters = ("-p", f"calibration:={skin_json}", "-p", f"port:='{url}'")
-        command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", *parameters]
+        remaps = ("-r", f"__node:={name}")
+        command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", *parameters, *remaps]
         started.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
         return started[-1]
 
@@ -156,20 +157,22 @@ def test_it_goes_on_when_the_board_is_plugged_20_times(node: Callable, reader: N
 
 def test_the_doctor_says_what_is_wrong(node: Callable, reader: Node) -> None:
     """A row that is torn off, by the service, and in the diagnostics after it."""
-    client, states = reader.create_client(Trigger, "/ohmskin/examine"), []
+    client, states = reader.create_client(Trigger, "/tip/examine"), []
     reader.create_subscription(
         DiagnosticArray, "/diagnostics", lambda each: states.append(each.status), 10
     )
-    node("emulator://8x8?scene=rest&seed=1&open_row=3")
+    node("emulator://8x8?scene=rest&seed=1&open_row=3", "tip")
     assert client.wait_for_service(ENOUGH_S)
-    said = asked(reader, client)
+    said, before = asked(reader, client), 0
     while "being opened" in said.message:
+        before = len(states)
         said = asked(reader, client)
+    assert len(states) >= before + 3  # diagnostics go on meanwhile
     assert not said.success
     assert "not sound: 1 finding, first open row (row 3)" in said.message
     until(reader, lambda: len(states) > 0 and len(states[-1]) == 2)
     doctor = states[-1][1]
-    assert doctor.name == "ohmskin: doctor"
+    assert (states[-1][0].name, doctor.name) == ("tip", "tip: doctor")  # of several nodes
     assert doctor.message == said.message
     assert doctor.values[0].key == "open_row: row 3"
     before = int(states[-1][0].values[0].value)  # scans
@@ -224,12 +227,39 @@ def test_the_terminal_says_what_is_wrong(skin_json: Path) -> None:
         assert "Traceback" not in printed
 
 
+def diagnosis_of(
+    skin_json: Path, text: str, meanwhile: Callable[[], object] = lambda: None
+) -> DiagnosticStatus:
+    """The first diagnosis with this text, of a node in this process. meanwhile: once it scans."""
+    from ohmskin_ros.node import SkinNode
+
+    told = ["--ros-args", "-p", f"calibration:={skin_json}", "-p", f"port:='{TOUCHED}'"]
+    states: list[DiagnosticStatus] = []
+    rclpy.init(args=told)
+    skin_node, watcher = SkinNode(), rclpy.create_node("watcher")
+    watcher.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda each: states.append(each.status[0]), 10
+    )
+    end_s = time.monotonic() + ENOUGH_S
+    try:
+        while not any(text in each.message for each in states):
+            assert time.monotonic() < end_s, [each.message for each in states]
+            rclpy.spin_once(skin_node, timeout_sec=0.1)
+            rclpy.spin_once(watcher, timeout_sec=0.1)
+            if states and skin_node.skin.newest() is not None:
+                meanwhile()
+    finally:
+        skin_node.close()
+        watcher.destroy_node()
+        rclpy.try_shutdown()
+    return next(each for each in states if text in each.message)
+
+
 def test_scans_that_are_skipped_are_a_warning(
     skin_json: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In this process, where an estimate takes as long as on a machine that is too slow."""
     from ohmskin.force.reader import SkinReader
-    from ohmskin_ros.node import SkinNode
 
     read = SkinReader.read
 
@@ -237,24 +267,35 @@ def test_scans_that_are_skipped_are_a_warning(
         time.sleep(0.05)
         return read(self, scan)
 
-    told = ["--ros-args", "-p", f"calibration:={skin_json}", "-p", f"port:='{TOUCHED}'"]
-    states = []
-    rclpy.init(args=told)
     monkeypatch.setattr(SkinReader, "read", slow)
-    skin_node, watcher = SkinNode(), rclpy.create_node("watcher")
-    watcher.create_subscription(
-        DiagnosticArray, "/diagnostics", lambda each: states.append(each.status[0]), 10
-    )
-    end_s = time.monotonic() + ENOUGH_S
-    while not any("were skipped: this machine is too slow" in each.message for each in states):
-        assert time.monotonic() < end_s
-        rclpy.spin_once(skin_node, timeout_sec=0.1)
-        rclpy.spin_once(watcher, timeout_sec=0.1)
-    warned = next(each for each in states if "were skipped" in each.message)
+    warned = diagnosis_of(skin_json, "were skipped: this machine is too slow")
     assert warned.level == DiagnosticStatus.WARN
-    skin_node.close()
-    watcher.destroy_node()
-    rclpy.try_shutdown()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_node_that_publishes_no_more_is_an_error(
+    skin_json: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It said OK, because scans came: the thread that had ended is the one that publishes them."""
+    from ohmskin_ros import node
+
+    monkeypatch.setattr(node, "image", lambda scan, head: 1 / 0)
+    wrong = diagnosis_of(skin_json, "nothing is published any more")
+    assert wrong.level == DiagnosticStatus.ERROR
+
+
+@pytest.mark.parametrize("set_by_s", [-3600, 3600])
+def test_stamps_that_are_off_are_a_warning(
+    skin_json: Path, monkeypatch: pytest.MonkeyPatch, set_by_s: int
+) -> None:
+    """The clock of the day is set while the node runs."""
+    now_ns = time.time_ns
+
+    def set_clock() -> None:
+        monkeypatch.setattr(time, "time_ns", lambda: now_ns() + set_by_s * 10**9)
+
+    warned = diagnosis_of(skin_json, "clock of this machine are 3600.0 s apart", set_clock)
+    assert warned.level == DiagnosticStatus.WARN
 
 
 def test_the_example_listens(node: Callable) -> None:
