@@ -57,10 +57,11 @@ class Pad:
         self._geoms = np.flatnonzero(model.geom_bodyid == model.site_bodyid[self._site])
         self._position_m = calibration.geometry.position_m
         self._normal = calibration.geometry.normal
-        # The distance to the nearest other taxel is that of neighbours, on any surface.
+        # The distance to the nearest other taxel is that of neighbours, on any surface. Where there
+        # is one taxel alone, it gets all of every force.
         taxels = self._position_m.reshape(-1, 3)
-        apart_m = np.linalg.norm(taxels[1:] - taxels[0], axis=1)
-        self.spread_m = float(apart_m.min()) if spread_m is None else spread_m
+        apart_m = np.linalg.norm(taxels[1:] - taxels[0], axis=1).min(initial=np.inf)
+        self.spread_m = float(apart_m) if spread_m is None else spread_m
         self.skin = ohmskin.SimulatedSkin(calibration, seed=seed)
 
     def force_n(self, data: mujoco.MjData) -> Float:

@@ -23,9 +23,9 @@ WEIGHT = """<mujoco><option timestep="0.001"/><worldbody>
 </worldbody></mujoco>"""
 
 
-def calibrated(path: Path, presses: Path) -> str:
+def calibrated(path: Path, presses: Path, skin: str = "emulator://8x8") -> str:
     for words in (
-        ("calibrate", "table", "emulator://8x8", presses, path, "--indenter-mm2", "80", *TOLD),
+        ("calibrate", "table", skin, presses, path, "--indenter-mm2", "80", *TOLD),
         ("skin", path, "--pitch-mm", "10,10"),
     ):
         subprocess.run([sys.executable, "-m", "ohmskin", *map(str, words)], check=True)
@@ -68,6 +68,17 @@ def test_a_weight_lies_on_the_skin(skin_json: str) -> None:
     assert scan.wrench[0] == pytest.approx([0, 0, -0.3 * 9.81], rel=0.02)
     (contact,) = scan.contacts
     assert (contact.row, contact.column) == pytest.approx((row, column), abs=0.3)
+
+
+def test_a_skin_of_one_cell_gets_the_whole_weight(tmp_path: Path) -> None:
+    """There is no other cell whose distance says how far the pad spreads a force."""
+    lines = [f"0,0,{force_n},{20e-6 * force_n}" for force_n in (1, 2, 4, 6, 8)]
+    (tmp_path / "one.csv").write_text("\n".join(["row,column,force_n,conductance", *lines]))
+    one = calibrated(tmp_path / "one.json", tmp_path / "one.csv", "emulator://1x1")
+    model, data = resting(0.3, x=0.012, y=-0.007)
+    for spread_m in (None, 0.01):
+        pad = Pad(model, "skin", ohmskin.load_calibration(one), spread_m=spread_m)
+        assert pad.force_n(data) == pytest.approx(np.array([[0.3 * 9.81]]), rel=1e-3)
 
 
 def test_nothing_touches_it(skin_json: str) -> None:
