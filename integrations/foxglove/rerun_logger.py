@@ -34,12 +34,13 @@ else:  # rr.spawn would let other computers reach the viewer
 count = logged = missed = 0
 said = ""
 with suppress(KeyboardInterrupt), ohmskin.LiveSkin(port, calibration) as skin:
-    while not skin.ended and not isinstance(skin.failure, ValueError):
+    over = False
+    while not over:
+        over = skin.ended or isinstance(skin.failure, ValueError)  # then `since` gives the last
         state = str(skin.failure or f"{port} {'gives scans' if count else 'is being opened'}")
         if state != said:
             print(said := state, flush=True)
         count, scans = skin.since(count, timeout_s=1.0)
-        logged += len(scans)
         for scan in scans:
             missed += scan.missed
             rr.set_time("time", timestamp=np.datetime64(scan.time_ns, "ns"))
@@ -49,7 +50,9 @@ with suppress(KeyboardInterrupt), ohmskin.LiveSkin(port, calibration) as skin:
             rr.log("skin/force", rr.Tensor(forces, dim_names=("row", "column")))
             for contact in scan.contacts:
                 rr.log(f"skin/contact/{contact.identity}", rr.Scalars(contact.force_n))
-late = skin.skipped + count - logged
-print(f"{logged} scans logged; {missed} missed on the line; {late} skipped by a busy machine")
+            logged += 1
+late = skin.skipped + skin.since(count)[0] - logged
+skipped = f"{late} skipped by a busy machine or at the end"
+print(f"{logged} scans logged; {missed} missed on the line; {skipped}")
 if isinstance(skin.failure, ValueError):  # such as a calibration of another skin
     sys.exit(f"rerun_logger: {skin.failure}")
