@@ -13,9 +13,10 @@ draws the places and the colours, which Foxglove takes, too, unless told to colo
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from foxglove.channels import PointCloudChannel
@@ -28,11 +29,12 @@ from foxglove.messages import (
     Timestamp,
     Vector3,
 )
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
 
 import ohmskin
 from ohmskin.arrays import FULL_SCALE_N, shades
+from ohmskin.files import whole_file
 from ohmskin.force.geometry import Geometry
 from ohmskin.force.tables import read_forces
 from ohmskin.record.export import Part
@@ -96,18 +98,34 @@ def _cloud(points: Any, time_ns: int, frame_id: str) -> PointCloud:
     )
 
 
+def _messages(file: BinaryIO) -> Iterator[Any]:
+    """Schemas, channels and messages of a recording, up to where it was cut off."""
+    try:
+        yield from NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
+    except OSError:
+        raise
+    except Exception:  # half a record: each reader of records and chunks has errors of its own
+        return
+
+
 def add_clouds(recording: Path, calibration: ohmskin.Calibration, out: Path) -> int:
     """Write a recording with all its channels and the clouds of its forces. Returns its scans.
 
-    `out` plays, exports and calibrates as the recording does.
+    `out` plays, exports and calibrates as the recording does. It is written whole or not at all. A
+    recording whose recorder was killed is taken up to its last whole chunk.
 
     :raises FileExistsError: `out` is there already.
     :raises RecordingError: the recording cannot be read.
-    :raises ValueError: the calibration is of another skin, or says no geometry.
+    :raises ValueError: the calibration is of another skin, or says no geometry; `out` cannot be
+        written.
     """
+    required(calibration.geometry)
+    if out.exists():
+        raise FileExistsError(f"{out}: is there already: say another file to write")
     part = Part(recording, timed=True)
     forces, schema = read_forces(part, calibration), PointCloud.get_schema()
-    with recording.open("rb") as read, out.open("xb") as file:
+    forces = chain([next(forces)], forces)  # what cannot be read is said before `out` is begun
+    with recording.open("rb") as read, whole_file(out) as file:
         writer = Writer(file)
         writer.start(profile="", library="ohmskin")
         pointed = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -116,7 +134,7 @@ def add_clouds(recording: Path, calibration: ohmskin.Calibration, out: Path) -> 
             for topic in (POINTS, CONTACTS)
         }
         channels: dict[int, int] = {}
-        for kind, channel, message in make_reader(read).iter_messages(log_time_order=False):
+        for kind, channel, message in _messages(read):
             if channel.topic in of_topic:  # of clouds that were added before
                 continue
             if channel.id not in channels:
@@ -130,6 +148,8 @@ def add_clouds(recording: Path, calibration: ohmskin.Calibration, out: Path) -> 
                 for topic, cloud in clouds(scan).items():
                     time_ns = scan.time_ns
                     writer.add_message(of_topic[topic], time_ns, cloud.encode(), time_ns)
+        if next(forces, None) is not None:
+            raise ohmskin.RecordingError(f"{recording}: damaged: the library mcap cannot read it")
         writer.finish()
     return part.scans
 

@@ -124,6 +124,49 @@ def test_clouds_are_added_once(both: Path, skin_json: Path, tmp_path: Path) -> N
     assert sorted(counts.values()) == [1, 900, 900, 900]
 
 
+@pytest.mark.parametrize("zeros", [0, 5000])  # as a system that crashed leaves them
+@pytest.mark.parametrize("share", [0.5, 0.503, 0.9])
+def test_a_recording_that_was_cut_off_gets_its_clouds(
+    recorded: Path, skin_json: Path, tmp_path: Path, share: float, zeros: int
+) -> None:
+    """It ended in a traceback, and left a file that could not be read."""
+    octets, cut = recorded.read_bytes(), tmp_path / "cut.mcap"
+    cut.write_bytes(octets[: round(share * len(octets))] + bytes(zeros))
+    scans = len(list(ohmskin.open(f"replay://{cut}?speed=0")))
+    out = tmp_path / "out.mcap"
+    assert run("-m", "ohmskin_foxglove", "add", cut, skin_json, out) == f"{out}: {scans} scans\n"
+    with out.open("rb") as file:
+        counts = make_reader(file).get_summary().statistics.channel_message_counts
+    assert sorted(counts.values()) == [1, scans, scans, scans]
+    assert 0 < scans < 900
+
+
+def test_what_cannot_be_added_is_said_and_leaves_no_file(
+    recorded: Path, skin_json: Path, tmp_path: Path
+) -> None:
+    """The file that was left stood in the way of the next try."""
+    odd, damaged, out = (tmp_path / name for name in ("odd.mcap", "damaged.mcap", "out.mcap"))
+    odd.write_text("no recording")
+    octets = bytearray(recorded.read_bytes())
+    octets[len(octets) // 2] ^= 255
+    damaged.write_bytes(octets)
+    for recording, said in (
+        (odd, f"{odd}: no MCAP file"),
+        (tmp_path / "none.mcap", "none.mcap: cannot be read"),
+        (damaged, f"{damaged}: damaged"),
+    ):
+        words = ("-m", "ohmskin_foxglove", "add", recording, skin_json, out)
+        done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True)
+        assert done.returncode == 1
+        assert said in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert not [*tmp_path.glob("out*"), *tmp_path.glob(".*")]
+    before = out.write_bytes(b"kept")
+    with pytest.raises(FileExistsError, match="is there already: say another file"):
+        add_clouds(recorded, ohmskin.load_calibration(skin_json), out)
+    assert out.stat().st_size == before
+
+
 def test_rerun_draws_the_clouds(both: Path, tmp_path: Path) -> None:
     """Its importer makes Points3D of them, by its own program."""
     out = tmp_path / "both.rrd"
@@ -301,3 +344,4 @@ def test_what_is_missing_is_said(recorded: Path, skin_json: Path, tmp_path: Path
     assert done.returncode == 1
     assert done.stderr.startswith("ohmskin-foxglove: nobody has said where the cells are: ohmskin")
     assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out.mcap").exists()
