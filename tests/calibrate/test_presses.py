@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ohmskin.arrays import Float
-from ohmskin.calibrate.presses import LevelHistory, find_presses
+from ohmskin.calibrate.presses import LevelHistory, find_presses, number_presses
 from ohmskin.calibrate.tables import ForceLog
 
 HZ = 90.0
@@ -88,6 +88,20 @@ def test_presses_in_quick_succession_are_several() -> None:
     found = find_presses(history(rise[:, None, None]), log_of(force_n), OFFSET_S)
     assert found.counts.item() == 3
     assert sorted(round(found.force_n[found.press == n].max()) for n in range(3)) == [1, 3, 8]
+
+
+@pytest.mark.parametrize(
+    ("rise", "numbers"),
+    [
+        ([0.2, 5, 8, 7.99, 8, 7.98, 8, 7.99, 8, 5, 0.2], [0] * 11),
+        ([0.2, 8, 7.9, 8, 1, 8, 7.9, 8, 0.2], [0] * 4 + [1] * 5),
+        ([8, 1, 5, 4.9, 5, 0.9, 8, 8, 7.9, 8], [0] + [1] * 4 + [2] * 5),
+    ],
+)
+def test_a_maximum_that_repeats_exactly_is_one_press(rise: list[float], numbers: list[int]) -> None:
+    """As where readings are whole steps of a converter. Deep valleys divide presses as ever."""
+    found = number_presses(np.zeros(len(rise), np.intp), np.array(rise))
+    np.testing.assert_array_equal(found, numbers)
 
 
 def test_sliding_from_cell_to_cell_is_a_press_of_each() -> None:

@@ -211,7 +211,13 @@ def _valleys(rise: Float) -> list[int]:
     # The padding is the untouched skin before and after: a run may begin or end with a peak.
     peaks, _ = find_peaks(np.pad(height, 1, constant_values=np.log(floor)), prominence=VALLEY_LOG)
     peaks -= 1
-    return [int(before + height[before:after].argmin()) for before, after in pairwise(peaks)]
+    valleys = []
+    for before, after in pairwise(peaks):
+        valley = int(before + height[before:after].argmin())
+        # Peaks of exactly one height count all or none, however little it falls between them.
+        if min(height[before], height[after]) - height[valley] >= VALLEY_LOG:
+            valleys.append(valley)
+    return valleys
 
 
 @dataclass(eq=False)
