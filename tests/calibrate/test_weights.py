@@ -14,10 +14,10 @@ import pytest
 import ohmskin
 from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
-from ohmskin.calibrate.guide import Press
+from ohmskin.calibrate.guide import Press, State, Step
 from ohmskin.calibrate.tables import load_press_table
 from ohmskin.circuit.skin import current_from_ratio
-from ohmskin.cli.weights import guided
+from ohmskin.cli.weights import KeptPresses, guided
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan
 from ohmskin.record.readings import load_readings
@@ -207,6 +207,49 @@ def test_a_full_table_is_fitted_at_once(weigh: Run, tmp_path: Path) -> None:
     done = weigh([], *OPTIONS)
     assert_one_line(done, "skin.presses.csv: row 4: conductance is -")
     assert out.read_bytes() == was
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> KeptPresses:
+    """Four presses, and readings that tell whose they are."""
+    kept = KeptPresses(tmp_path / "skin.presses.csv")
+    for n, column in enumerate((0, 0, 1, 1)):
+        scan = Scan(np.full((1, 2, 4), 100 * n, np.uint16), 0, n, 0.0, 0)
+        step = Step(State.TAKE_OFF, Press((0, column), 1.0), rise=1.1e-6 * (n + 1), rise_std=0.0)
+        kept.add(step, np.zeros((1, 2)), [scan])
+    return kept
+
+
+def kept_readings(path: Path) -> list[int] | None:
+    ratios = KeptPresses(path).ratios
+    return None if ratios is None else np.round(1023 * ratios[:, 0, 0, 0], -1).astype(int).tolist()
+
+
+def test_a_table_that_is_edited_by_hand_keeps_the_readings_of_each_press(kept: KeptPresses) -> None:
+    """They were those of the row of the same number, whichever row had been deleted."""
+    assert kept_readings(kept.path) == [0, 100, 200, 300]
+    header, *rows = kept.path.read_text().splitlines()
+    for lines, readings in (
+        (rows[:1] + rows[2:], [0, 200, 300]),
+        (rows[::-1], [300, 200, 100, 0]),
+        ([row.replace(",1.0,", ",2.5,") for row in rows[:2]], [0, 100]),
+        ([f"0,1,1,{float(rows[3].split(',')[3]):.5e},0"], [300]),  # a spreadsheet's digits
+        ([*rows, "0,1,1.0,9e-6,0"], None),
+        ([rows[0], rows[0]], None),
+    ):
+        kept.path.write_text("\n".join([header, *lines]) + "\n")
+        assert kept_readings(kept.path) == readings
+
+
+def test_readings_of_before_tables_were_keyed_count_where_all_are_there(kept: KeptPresses) -> None:
+    npz = kept.path.with_suffix(".npz")
+    np.savez(npz, ratio=load_readings(npz).ratio)
+    assert kept_readings(kept.path) == [0, 100, 200, 300]
+    lines = kept.path.read_text().splitlines(keepends=True)
+    kept.path.write_text("".join(lines[:2] + lines[3:]))
+    assert kept_readings(kept.path) is None
+    KeptPresses(kept.path).keep_those([True, True, False])
+    assert not npz.exists()
 
 
 def test_all_presses_can_be_redone(weigh: Run, tmp_path: Path) -> None:

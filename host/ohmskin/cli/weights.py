@@ -19,7 +19,7 @@ from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.link.device import Device, mean_ratio
 from ohmskin.link.messages import Scan
 from ohmskin.record.force_sensor import NEWTONS
-from ohmskin.record.readings import load_readings, save_arrays
+from ohmskin.record.readings import load_arrays, load_readings, save_arrays
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import ForceSample, Mark, Recording
 
@@ -27,6 +27,11 @@ from ohmskin.record.recording import ForceSample, Mark, Recording
 WEIGHTS: Final = "weights"
 # The cell of a press that may be anywhere: the skin is taken for one cell.
 ANYWHERE: Final = (0, 0)
+# By these columns of the table, the readings of a press are found.
+_KEYS: Final = ("row", "column", "conductance")
+# Conductances are the same if they differ by less than this share. Chosen: a spreadsheet program
+# may keep six digits of a number.
+_SAME_SHARE: Final = 1e-5
 
 
 class KeptPresses:
@@ -34,6 +39,8 @@ class KeptPresses:
 
     Both files are written anew, and whole, at each change: the readings first. If the program is
     killed in between, the readings have one press more than the table; then the table counts.
+    Each of the readings is found by cell and conductance, because people delete rows of a table by
+    hand, and mend its forces.
 
     ratios: mean readings under each press, (n, R, C, 4); None: they are not known of all, as of a
         table that somebody else has made.
@@ -45,8 +52,8 @@ class KeptPresses:
         self.ratios: Float | None = None
         if self._readings_path.exists() and self.table.size:
             ratios = load_readings(self._readings_path).ratio
-            if len(ratios) >= self.table.size:
-                self.ratios = ratios[: self.table.size]
+            of_rows = _rows_of(self.table, load_arrays(self._readings_path, _KEYS), len(ratios))
+            self.ratios = None if of_rows is None else ratios[of_rows]
 
     @property
     def presses(self) -> list[Press]:
@@ -94,9 +101,33 @@ class KeptPresses:
             self.path.unlink(missing_ok=True)
             self._readings_path.unlink(missing_ok=True)
             return
-        if self.ratios is not None:
-            save_arrays(self._readings_path, {"ratio": self.ratios})
+        if self.ratios is None:
+            self._readings_path.unlink(missing_ok=True)  # they are of some presses only
+        else:
+            keys = {name: self.table[name] for name in _KEYS}
+            save_arrays(self._readings_path, {"ratio": self.ratios} | keys)
         save_press_table(self.path, self.table)
+
+
+def _rows_of(table: PressTable, keys: dict[str, Float], count: int) -> list[int] | None:
+    """Which of so many readings is of each press of a table; None: they are not known of all.
+
+    keys: arrays of `_KEYS`, by which the readings are known. Files of before have none.
+    """
+    if not keys:
+        return [*range(count)] if count == table.size else None
+    if [each.shape for each in keys.values()] != [(count,)] * len(_KEYS):
+        return None
+    found: list[int] = []
+    for press in table:
+        same = np.ones(count, dtype=bool)
+        same[found] = False  # each is of one press alone
+        for name, values in keys.items():
+            same &= np.isclose(values, press[name], rtol=_SAME_SHARE, atol=0.0)
+        if not same.any():
+            return None
+        found.append(int(same.argmax()))
+    return found
 
 
 class KeptAnywhere:

@@ -168,6 +168,20 @@ def load_readings(path: PathName) -> Readings:
 
     Raises ValueError, one line that names the file and the array, for whatever is wrong with it.
     """
+    arrays = load_arrays(path, Readings.__dataclass_fields__)
+    with naming(path):
+        if "ratio" not in arrays:
+            raise ValueError("no array 'ratio'")
+        for name in _SCALARS & arrays.keys():
+            arrays[name] = arrays[name].item()
+        return Readings(**arrays)
+
+
+def load_arrays(path: PathName, names: Iterable[str]) -> dict[str, Any]:
+    """Those arrays of a file that have one of these names, as they are. Raises as `load_readings`.
+
+    Text becomes a tuple, and readings keep their type; all else is float64.
+    """
     arrays: dict[str, Any] = {}
     name = "the archive"
     with naming(path):
@@ -176,7 +190,7 @@ def load_readings(path: PathName) -> Readings:
             with _Pieces(path) as file, zipfile.ZipFile(file) as archive:
                 present = {info.filename: info for info in archive.infolist()}
                 left_bytes = MAX_ARRAY_BYTES
-                for name in Readings.__dataclass_fields__:
+                for name in names:
                     info = present.get(f"{name}.npy")
                     if info is not None:
                         arrays[name] = _read_array(archive, info, left_bytes)
@@ -187,11 +201,7 @@ def load_readings(path: PathName) -> Readings:
         except Exception as error:  # damage may raise nearly anything in zipfile, zlib and numpy
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise ValueError(f"{name} cannot be read: {reason}") from error
-        if "ratio" not in arrays:
-            raise ValueError("no array 'ratio'")
-        for name in _SCALARS & arrays.keys():
-            arrays[name] = arrays[name].item()
-        return Readings(**arrays)
+    return arrays
 
 
 class _Pieces(FileIO):
