@@ -147,10 +147,27 @@ def test_a_column_is_named_or_numbered() -> None:
     numbered = ForceLineDecoder(column="4")
     assert numbered.feed(lines) == [-3.5, -4.0]
     assert numbered.damaged == 4  # the header, too
-    for column in ("Fq", "0", "9"):
+    for column in ("Fq", "9"):
         decoder = ForceLineDecoder(column=column)
         assert decoder.feed(lines) == []
         assert decoder.damaged == 6
+
+
+def test_what_a_sensor_prints_first_does_not_hide_its_column() -> None:
+    """Such a line told how many fields all others were to have, and no force was read any more."""
+    lines = b"0.1,-0.2,12.3\r\n" * 50
+    decoder = ForceLineDecoder(column="3")
+    assert decoder.feed(b"boot\r\nHX711 ready\r\n" + lines) == [12.3] * 50
+    assert decoder.damaged == 1  # the first line may be a part of one
+    # Such a line may look like forces: then it takes ten lines to see that it was not.
+    decoder = ForceLineDecoder(column="3")
+    assert decoder.feed(b"\nversion,1,2,2024\n" + lines) == [2.0, *[12.3] * 41]
+    # Damage never lasts so long.
+    damaged = b"0.1,-0.2,12.3,5\r\n" * 9
+    assert decoder.feed(damaged + lines + damaged) == [12.3] * 50
+    for column in ("0", "00"):
+        with pytest.raises(ValueError, match="no column 0 of force: the first one is 1"):
+            ForceLineDecoder(column=column)
 
 
 def test_the_first_line_may_be_the_only_header() -> None:

@@ -61,6 +61,9 @@ _RISES_OF_TIME: Final = 8
 # Where the first of them does not rise, as a time where the sensor is reset, so many rises more are
 # needed. Chosen: a force that is pressed and let go rises more seldom for each time that it falls.
 _RISES_OF_BREAK: Final = 100
+# If so many lines in a row have another number of fields than those before, it counts from now on.
+# Chosen: no damage does the same to so many lines.
+_LINES_THAT_AGREE: Final = 10
 # An error shows so many characters of a line. Chosen: enough to recognise the line.
 _SHOWN_CHARS: Final = 40
 
@@ -79,7 +82,7 @@ class ForceLineDecoder:
     damaged: how many lines had no force that could be read; blank lines and headers do not count.
     last_damaged: the newest of these lines, cut to some characters.
 
-    :raises ValueError: no such unit.
+    :raises ValueError: no such unit, or column is 0.
     """
 
     LARGEST_LINE_BYTES: Final = 256
@@ -91,7 +94,11 @@ class ForceLineDecoder:
         self.last_damaged = ""
         self._newtons_per_unit, self._unit, self._column = newtons_per_unit, unit, column
         self._place = int(column) - 1 if column.isdecimal() else -1  # -1: no header has come
-        self._fields = 0  # how many fields lines have; 0: none has come
+        if column and not column.strip("0"):
+            raise ValueError("there is no column 0 of force: the first one is 1")
+        # How many fields lines with a force have; 0: none has come. Of the newest such lines, too,
+        # unless a header has told: a sensor may print something else first.
+        self._fields, self._newest = 0, deque[int](maxlen=_LINES_THAT_AGREE)
         self._is_stated = False  # whether a line has stated its unit
         # The first number of the last line, if it may be a time, and how often it has risen; below
         # 0: how many rises more it takes to make good what did not rise.
@@ -148,10 +155,15 @@ class ForceLineDecoder:
     def _in_column(self, line: str) -> re.Match[str] | None:
         """The wanted column of a line; None if the line has not as many fields as the others."""
         fields = _COMMAS.split(line)
-        self._fields = self._fields or len(fields)
-        if not 0 <= self._place < len(fields) == self._fields:
+        if not 0 <= self._place < len(fields):
             return None
-        return _FIELD.fullmatch(fields[self._place])
+        found = _FIELD.fullmatch(fields[self._place])
+        if found and self._column.isdecimal():
+            self._newest.append(len(fields))
+            agree = self._newest.count(len(fields)) == _LINES_THAT_AGREE
+            if agree or not self._fields:
+                self._fields = len(fields)
+        return found if len(fields) == self._fields else None
 
     def _alone(self, line: str) -> re.Match[str] | None:
         """The number of a line that has only this number, or a time and this number."""
@@ -177,7 +189,7 @@ class ForceSensor(Closing):
         sensor is mounted upside down.
 
     :raises PortError: as `SerialLink`.
-    :raises ValueError: newtons_per_unit is 0 or not finite, or there is no such unit.
+    :raises ValueError: newtons_per_unit is 0 or not finite, or there is no such unit or column.
     """
 
     def __init__(
