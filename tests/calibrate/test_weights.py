@@ -15,12 +15,15 @@ import ohmskin
 from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.calibrate.guide import Press, State, Step
+from ohmskin.calibrate.sessions import joined
 from ohmskin.calibrate.tables import load_press_table
 from ohmskin.circuit.skin import current_from_ratio
-from ohmskin.cli.weights import KeptPresses, guided
+from ohmskin.cli.weights import ANYWHERE, KeptAnywhere, KeptPresses, guided
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan
 from ohmskin.record.readings import load_readings
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import Tare, load_recording
 from scripted_skin import REST, ScriptedSkin, rise
 
 Cell = tuple[int, int]
@@ -250,6 +253,25 @@ def test_readings_of_before_tables_were_keyed_count_where_all_are_there(kept: Ke
     assert kept_readings(kept.path) is None
     KeptPresses(kept.path).keep_those([True, True, False])
     assert not npz.exists()
+
+
+def test_scans_that_came_in_one_read_have_one_force_of_a_weight(tmp_path: Path) -> None:
+    """Two of one time were no log of forces, which was found out after the last placement."""
+    path = tmp_path / "skin.weights-1.mcap"
+    codes = np.zeros((1, 2, 4), np.uint16)
+    scans = [Scan(codes, n, 10_000 * n, 0.03 * (n // 3), 0) for n in range(30)]
+    with ohmskin.open("emulator://1x2?speed=0") as skin, Recorder(path, skin.info) as recorder:
+        recorder.add(Tare(scans[0].ratio, -1.0))
+        for scan in scans:
+            recorder.add(scan)
+        step = Step(State.TAKE_OFF, Press(ANYWHERE, 2.0), rise=1e-6)
+        KeptAnywhere(recorder).add(step, np.zeros((1, 2)), scans)
+    given = load_recording(path)
+    times_s = sorted({scan.host_time_s for scan in given.scans})
+    assert [force.host_time_s for force in given.forces] == times_s
+    # So it is with recordings of before.
+    given.forces = [force for force in given.forces for _ in range(2)]
+    assert len(joined([given]).forces) == len(times_s)
 
 
 def test_all_presses_can_be_redone(weigh: Run, tmp_path: Path) -> None:

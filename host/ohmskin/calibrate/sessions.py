@@ -51,7 +51,8 @@ def joined(recordings: list[Recording]) -> Recording:
 
     The rest moves from day to day, so the readings of the others are moved from their own rest to
     this one. What the force sensor shows while nothing touches the skin, up to the tare, is taken
-    off the forces of each. Raises ValueError if they are not of one skin in one mode.
+    off the forces of each. Of several forces of one time, the last counts. Raises ValueError if
+    they are not of one skin in one mode.
     """
     check_same(recordings, recordings[-1].hellos[-1])
     last = next(
@@ -75,7 +76,7 @@ def joined(recordings: list[Recording]) -> Recording:
         zero_n = _zero_n(given.forces, given.tares[0].host_time_s)
         whole.forces += [
             replace(f, force_n=f.force_n - zero_n, host_time_s=f.host_time_s + later_s)
-            for f in given.forces
+            for f in {f.host_time_s: f for f in given.forces}.values()
         ]
         end_s, end_us = whole.scans[-1].host_time_s, whole.scans[-1].time_us
     return whole

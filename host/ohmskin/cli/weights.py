@@ -143,8 +143,9 @@ class KeptAnywhere:
         """Keep the press of a step which has read it from these scans."""
         assert step.wanted is not None
         force_n = step.wanted.force_n
-        for scan in window:
-            self._recorder.add(ForceSample(force_n, scan.host_time_s, source=WEIGHTS))
+        # Scans that came in one read have the same time, of which there is one force.
+        for time_s in sorted({scan.host_time_s for scan in window}):
+            self._recorder.add(ForceSample(force_n, time_s, source=WEIGHTS))
         self._recorder.add(Mark(repr(force_n), self._recorder.now_s()))
 
     def recorded(self, scans: Iterable[Scan]) -> Iterator[Scan]:
