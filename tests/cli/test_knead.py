@@ -199,6 +199,21 @@ def test_weights_are_put_anywhere(run: Run, tmp_path: Path) -> None:
         assert_one_line(done, "--anywhere without --indenter-mm2, --cells, --redo")
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--grams", "200"), "all 20 forces are 1.96133 N: press with different forces"),
+        (("--grams", "100,200", "--repeats", "2"), "too few presses: 4, 5 are needed"),
+    ],
+)
+def test_weights_that_teach_nothing_are_refused_before_they_are_put_on(
+    run: Run, tmp_path: Path, options: tuple[str, ...], words: str
+) -> None:
+    out = str(tmp_path / "skin.json")
+    done = run("calibrate", "weights", "/dev/no_port", out, "--anywhere", *options)
+    assert_one_line(done, f"--grams, --repeats: {words}")
+
+
 def test_a_board_and_a_scale_at_ports_are_enough(
     run: Run, command: Command, tmp_path: Path
 ) -> None:

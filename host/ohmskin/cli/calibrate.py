@@ -164,7 +164,11 @@ def _weigh_anywhere(port: str, out: Path, forces_n: Float, calibrator_of: _Calib
     before, path = session_paths(out, "weights")
     recordings = [load_recording(each) for each in before]
     wanted = [Press(ANYWHERE, force_n) for force_n in forces_n.tolist()]
-    missing = still_wanted(wanted, put_anywhere(recordings))
+    read = put_anywhere(recordings)
+    missing = still_wanted(wanted, read)
+    with naming("--grams, --repeats"):  # before anybody puts them on
+        every = [*read, *missing]
+        check_enough(len(every), [press.force_n for press in every])
     if missing:
         with ohmskin.open(port) as skin:
             skin.only_unit = skin.info.unit_id
