@@ -115,6 +115,25 @@ def test_recordings_are_joined_on_one_clock_and_zero(tmp_path: Path) -> None:
     assert whole.tares[0] is both[1].tares[0]
 
 
+def test_a_recording_that_was_removed_hides_no_later_one(tmp_path: Path) -> None:
+    for number in (2, 3, 10):
+        (tmp_path / f"skin[1].knead-{number}.mcap").touch()
+    for name in ("skin[1].knead-x.mcap", "skin[1].weights-1.mcap", "skin1.knead-1.mcap"):
+        (tmp_path / name).touch()
+    paths, following = session_paths(tmp_path / "skin[1].json", "knead")
+    names = [path.name for path in (*paths, following)]
+    assert names == [f"skin[1].knead-{number}.mcap" for number in (2, 3, 10, 11)]
+
+
+def test_calibrations_whose_names_begin_alike_share_no_recording(tmp_path: Path) -> None:
+    """All after the last point was taken for an ending, as of left.a and left.b."""
+    (tmp_path / "left.a.knead-1.mcap").touch()
+    assert session_paths(tmp_path / "left.b", "knead") == ([], tmp_path / "left.b.knead-1.mcap")
+    assert session_paths(tmp_path / "left", "knead") == ([], tmp_path / "left.knead-1.mcap")
+    for out in ("left.a", "left.a.json"):
+        assert session_paths(tmp_path / out, "knead")[1].name == "left.a.knead-2.mcap"
+
+
 def test_a_rest_that_has_moved_between_recordings_is_no_force() -> None:
     """All scans were taken to be above the newest rest."""
     newest_rest = np.random.default_rng(3).uniform(0.5e-6, 1.5e-6, (2, 3))

@@ -6,6 +6,7 @@ A recording cannot be written on, so whoever goes on writes a new one: ``skin.kn
 """
 
 from dataclasses import dataclass, field, fields, replace
+from glob import escape
 from pathlib import Path
 from typing import Final
 
@@ -23,12 +24,24 @@ PAUSE_S: Final = 100.0
 _LEAST_V: Final = 1e-3
 
 
+def beside(out: Path, ending: str) -> Path:
+    """A file beside a calibration: its whole name, less ``.json``, with this ending."""
+    return out.with_name(out.name.removesuffix(".json") + ending)
+
+
 def session_paths(out: Path, what: str) -> tuple[list[Path], Path]:
-    """The recordings beside a calibration that are there, in order; and the name of the next."""
-    paths: list[Path] = []
-    while (path := out.with_suffix(f".{what}-{len(paths) + 1}.mcap")).exists():
-        paths.append(path)
-    return paths, path
+    """The recordings beside a calibration that are there, in order; and the name of the next.
+
+    Numbers may be missing, because people remove recordings that are bad.
+    """
+    begin = beside(out, f".{what}-").name
+    there = {
+        int(number): path
+        for path in out.parent.glob(f"{escape(begin)}*.mcap")
+        if (number := path.stem.removeprefix(begin)).isdecimal()
+    }
+    following = max(there, default=0) + 1
+    return [there[number] for number in sorted(there)], beside(out, f".{what}-{following}.mcap")
 
 
 def check_same(recordings: list[Recording], board: Hello) -> None:

@@ -21,7 +21,7 @@ from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.rules import check_cells_differ, check_enough
 from ohmskin.calibrate.scale import printed_s
-from ohmskin.calibrate.sessions import check_same, joined, session_paths
+from ohmskin.calibrate.sessions import beside, check_same, joined, session_paths
 from ohmskin.calibrate.tables import ForceLog, load_force_log, load_press_table
 from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
 from ohmskin.cli.knead import kneaded
@@ -116,7 +116,7 @@ def weights(
     if anywhere:
         _weigh_anywhere(port, out, np.repeat(forces_n, repeats or 20), calibrator_of)
         return
-    kept = KeptPresses(out.with_suffix(".presses.csv"))
+    kept = KeptPresses(beside(out, ".presses.csv"))
     with ohmskin.open(port) as skin:
         skin.only_unit = skin.info.unit_id  # no other may come while nobody looks
         shape = skin.info.rows, skin.info.columns
