@@ -3,6 +3,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +11,14 @@ from scipy.integrate import solve_ivp
 
 from command_line import Run, assert_one_line, well
 from kneaded_skin import KneadedSkin
+from kneaded_skin import Scale as ScaleBelow
 from ohmskin.arrays import Float
 from ohmskin.calibrate.scale import Scale, fit_scale, printed_s
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.force.calibration import load_calibration
+from ohmskin.link.messages import Scan
+from ohmskin.record.recorder import Recorder
+from ohmskin.record.recording import ForceSample, load_recording
 from pressed_skin import Plan
 
 STEP_S = 0.02
@@ -175,12 +180,49 @@ def test_presses_beside_the_skin_are_left_out(fit: tuple[TotalFit, Float, list[i
     assert len(wrong) <= 1
 
 
-def test_a_skin_that_was_kneaded_reads_forces(run: Run, tmp_path: Path) -> None:
-    skin = KneadedSkin(Plan((100.0, 200.0), "series", 1, shape=(4, 4), touches=40), scans=2500)
+@pytest.fixture(scope="module")
+def skin() -> KneadedSkin:
+    return KneadedSkin(Plan((100.0, 200.0), "series", 1, shape=(4, 4), touches=40), scans=2500)
+
+
+def changed(path: Path, *, scans: list[Scan] | None = None, forces: list[ForceSample]) -> None:
+    """Put other scans, or other forces, into a recording."""
+    given = load_recording(path)
+    path.unlink()
+    with Recorder(path, given.hellos[0]) as recorder:
+        for message in [*given.tares, *(given.scans if scans is None else scans), *forces]:
+            recorder.add(message)
+
+
+def learned(run: Run, recording: Path, out: Path, *options: str) -> dict[str, Any]:
+    """What is said of a calibration that was made of a recording."""
+    command = ("calibrate", "recording", str(recording), str(out), "--total", "--json", *options)
+    said: dict[str, Any] = json.loads(well(run(*command)).out)
+    return said
+
+
+def test_a_log_of_the_scale_may_be_late_and_untared(
+    skin: KneadedSkin, run: Run, tmp_path: Path
+) -> None:
+    """Its numbers were taken for the force itself, as known weights are."""
+    recording, out, log = tmp_path / "knead.mcap", tmp_path / "skin.json", tmp_path / "scale.csv"
+    below = ScaleBelow(rate_hz=10.0, delay_s=0.05, pole_s=0.1, noise_n=0.01, drift_n=0.1)
+    skin.record_kneading(recording, below)
+    changed(recording, forces=[])
+    time_s, force_n = skin.total(below, beside=True)
+    rows = np.column_stack([time_s + 1000.0, force_n + 5.0])
+    np.savetxt(log, rows, delimiter=",", header="time_s,force_n", comments="")
+    said = learned(run, recording, out, "--forces", str(log))
+    assert said["offset_s"] + said["lag_s"] == pytest.approx(-1000.0, abs=0.2)
+    assert skin.read_tips(out).rmse_n() < 0.15
+
+
+def test_a_skin_that_was_kneaded_reads_forces(
+    skin: KneadedSkin, run: Run, tmp_path: Path
+) -> None:
     recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
     skin.record_kneading(recording)
-    done = well(run("calibrate", "recording", str(recording), str(out), "--total", "--json"))
-    said = json.loads(done.out)
+    said = learned(run, recording, out)
     assert said["left_out"] == []
     assert abs(said["lag_s"]) < 0.03
     calibration = load_calibration(out)

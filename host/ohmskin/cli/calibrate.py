@@ -317,13 +317,13 @@ def _knead(
     log: forces whose times are by another clock; None: the forces in the recording are taken.
     """
     kneading, offset_s = Kneading(calibrator, given.scans), 0.0
+    lags = log is not None or any(sample.source != WEIGHTS for sample in given.forces)
     if log is None:
         log = _log_in(given, any_zero=True)
     else:
         above = replace(log, force_n=np.maximum(log.force_n - np.quantile(log.force_n, 0.02), 0.0))
         offset_s = align(kneading.time_s, kneading.of_skin, above).offset_s
         log = replace(log, time_s=log.time_s + offset_s, any_zero=True)
-    lags = any(sample.source != WEIGHTS for sample in given.forces)
     fit = kneading.learn(log, progress("scans"), lags=lags)
     calibration = calibrator.calibration_of(fit.model(kneading.shape), fit.largest_n)
     calibration.save(out)
