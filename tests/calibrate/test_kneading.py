@@ -2,6 +2,7 @@
 """``calibrate recording --total``: curves of all cells from the force on the whole skin."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -214,6 +215,20 @@ def test_a_log_of_the_scale_may_be_late_and_untared(
     np.savetxt(log, rows, delimiter=",", header="time_s,force_n", comments="")
     said = learned(run, recording, out, "--forces", str(log))
     assert said["offset_s"] + said["lag_s"] == pytest.approx(-1000.0, abs=0.2)
+    assert skin.read_tips(out).rmse_n() < 0.15
+
+
+def test_forces_while_the_board_was_reset_teach_nothing(
+    skin: KneadedSkin, run: Run, tmp_path: Path
+) -> None:
+    """They were fitted with rises between those before and after it."""
+    recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
+    skin.record_kneading(recording, ScaleBelow(10.0, 0.05, 0.1, 0.01, 0.1))
+    given = load_recording(recording)
+    scans, begin_us = given.scans, given.scans[1300].time_us
+    after = [replace(s, number=n, time_us=s.time_us - begin_us) for n, s in enumerate(scans[1300:])]
+    changed(recording, scans=scans[:1200] + after, forces=given.forces)
+    learned(run, recording, out)
     assert skin.read_tips(out).rmse_n() < 0.15
 
 

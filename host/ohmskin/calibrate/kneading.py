@@ -36,7 +36,7 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.presses import Calibrator, Progress, number_presses
-from ohmskin.calibrate.tables import ForceLog
+from ohmskin.calibrate.tables import GAP_S, GAP_STEPS, ForceLog
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.calibrate.wires import FoundWires, wire_prior
 from ohmskin.circuit.skin import PortCircuit
@@ -66,6 +66,9 @@ PAUSE_SCANS: Final = 200
 # A rise below so many times the largest one of a usual pause counts as none. Chosen: errors in
 # pauses are seldom twice as large.
 PAUSE_TIMES: Final = 2.0
+# While a board is reset, nobody sees what presses the skin. The scale still shows it for so long
+# after this gap of the scans [s]. Chosen: the slowest scales need it.
+AFTER_GAP_S: Final = 1.0
 # There are at most so many trials of the wires. The steps are logs: the longest one that is taken,
 # the one below which trials take more cells, and the one below which they end.
 TRIALS, LONGEST_STEP, SHORT_STEP, LAST_STEP = 8, 1.5, 0.5, 0.1
@@ -202,7 +205,7 @@ class Kneading:
         return _Levels(rise, rest, good if self._weighed is None else good & self._weighed)
 
     def _totals(self, levels: _Levels, log: ForceLog) -> Totals:
-        """What skin and scale have shown. Numbers of the scale beside unused scans are left out.
+        """What skin and scale have shown. Numbers of the scale beside unused scans, or of gaps, are left out.
 
         If the scale has shown more numbers than there are scans, forces are taken at the scans.
         """
@@ -217,10 +220,18 @@ class Kneading:
             at_s = time_s
         shown_n = log.at(at_s)
         scan = np.searchsorted(time_s, at_s).clip(0, time_s.size - 1)
-        known = np.isfinite(shown_n) & used[scan]
+        known = np.isfinite(shown_n) & used[scan] & ~self._unseen(at_s)
         if not known.any():
             raise ValueError("skin and scale were not read at the same time")
         return Totals(*of_scans, at_s[known], shown_n[known])
+
+    def _unseen(self, at_s: Float) -> Bool:
+        """Whether what the scale shows then, (m,) [s], may be of a gap of the scans."""
+        steps_s = np.diff(self.time_s)
+        before = np.flatnonzero(steps_s > max(GAP_S, GAP_STEPS * float(np.median(steps_s))))
+        begun = np.searchsorted(self.time_s[before], at_s)
+        until_s = np.concatenate([[-np.inf], self.time_s[before + 1] + AFTER_GAP_S])
+        return np.asarray(at_s < until_s[begun])
 
     def _margin(self, rise: Float) -> Float:
         """How many cells that seem untouched are beside touched ones, (n,)."""
