@@ -14,7 +14,7 @@ from command_line import Run, assert_one_line, well
 from kneaded_skin import KneadedSkin
 from kneaded_skin import Scale as ScaleBelow
 from ohmskin.arrays import Float
-from ohmskin.calibrate.scale import Scale, fit_scale, printed_s
+from ohmskin.calibrate.scale import Scale, fit_scale, printed_s, wrong_numbers
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan
@@ -113,6 +113,35 @@ def test_times_of_a_scale_never_go_back(busy_s: float) -> None:
     assert np.all(np.diff(found_s) >= 0)
     sound = (true_s < 5) | (true_s > 20 + 2 * busy_s + 15)
     assert found_s[sound] == pytest.approx(true_s[sound], abs=0.01)
+
+
+@pytest.mark.parametrize(("step_s", "press_s"), [(0.1, 0.4), (0.1, 0.15), (0.0125, 0.4)])
+def test_wrong_numbers_of_a_scale_are_told_from_presses(step_s: float, press_s: float) -> None:
+    """Five of 700 at 50 N made the error of all forces 2 N."""
+    random = np.random.default_rng(3)
+    time_s = np.arange(0.0, 70.0, step_s)
+    number, phase_s = np.divmod(time_s, 0.6)
+    peak_n = random.uniform(1, 12, 200)[number.astype(int)]
+    force_n = np.where(phase_s < press_s, peak_n * np.sin(np.pi * phase_s / press_s), 0.0)
+    force_n += 5.0 + 0.01 * random.standard_normal(time_s.size)
+    assert not wrong_numbers(force_n).any()
+    bad = [20, 200, 201, 350, time_s.size - 1]
+    for wrong_n in (50.0, 1000.0, -1e6):
+        force_n[bad] = wrong_n
+        assert np.flatnonzero(wrong_numbers(force_n)).tolist() == bad
+
+
+def test_times_of_a_scale_rise_over_a_stall() -> None:
+    """Numbers that waited for 4.5 s, twice, seemed to be from before those that came earlier."""
+    true_s = 0.1 * np.arange(400)
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        arrival_s = true_s + random.exponential(0.005, true_s.size)
+        for begin_s in random.uniform(3, 35, 3):
+            waits = (true_s > begin_s) & (true_s < begin_s + 4.5)
+            arrival_s = np.where(waits, np.maximum(arrival_s, begin_s + 4.5), arrival_s)
+        arrival_s = np.maximum.accumulate(arrival_s) + 1e-6 * np.arange(true_s.size)
+        assert np.all(np.diff(printed_s(arrival_s)) > 0)
 
 
 def test_a_scale_that_prints_when_it_likes_keeps_its_times() -> None:
@@ -232,9 +261,20 @@ def test_forces_while_the_board_was_reset_teach_nothing(
     assert skin.read_tips(out).rmse_n() < 0.15
 
 
-def test_a_skin_that_was_kneaded_reads_forces(
+def test_wrong_numbers_of_the_scale_are_left_out(
     skin: KneadedSkin, run: Run, tmp_path: Path
 ) -> None:
+    recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
+    skin.record_kneading(recording, ScaleBelow(10.0, 0.05, 0.1, 0.01, 0.1))
+    forces = load_recording(recording).forces
+    for number in (50, 133, 220, 310, 400):
+        forces[number] = replace(forces[number], force_n=50.0)
+    changed(recording, forces=forces)
+    assert learned(run, recording, out)["wrong_numbers"] == 5
+    assert skin.read_tips(out).rmse_n() < 0.15
+
+
+def test_a_skin_that_was_kneaded_reads_forces(skin: KneadedSkin, run: Run, tmp_path: Path) -> None:
     recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
     skin.record_kneading(recording)
     said = learned(run, recording, out)

@@ -205,9 +205,10 @@ class Kneading:
         return _Levels(rise, rest, good if self._weighed is None else good & self._weighed)
 
     def _totals(self, levels: _Levels, log: ForceLog) -> Totals:
-        """What skin and scale have shown. Numbers of the scale beside unused scans, or of gaps, are left out.
+        """What skin and scale have shown.
 
-        If the scale has shown more numbers than there are scans, forces are taken at the scans.
+        Numbers of the scale beside unused scans, and those of gaps of the scans, are left out. If
+        the scale has shown more numbers than there are scans, forces are taken at the scans.
         """
         time_s, used = self.time_s, levels.used
         rise = levels.rise[used]

@@ -24,7 +24,7 @@ from typing import Final
 
 import numpy as np
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.link.clock import without_delays_s
 
 # Filters begin the search from all pairs of these [s]. Chosen: from a fast load cell to a kitchen
@@ -43,10 +43,16 @@ MOST_POINTS: Final = 40
 
 # A scale that prints nothing for so long has made a pause [s].
 SILENCE_S: Final = 2.0
+# Numbers before and after a pause are so far apart at least [s]. Chosen: less than any scale's step.
+LEAST_BETWEEN_S: Final = 1e-4
 # Numbers were lost between two windows of so many seconds if the earliest number of the second one
 # is later, by half a step or more, than that of the first [s]. Chosen: no machine is too busy for
 # so long.
 LOST_WINDOW_S: Final = 5.0
+# A number is wrong if it is far from the median of so many around it: by more than these medians
+# span, and by so many times what only this share of the numbers exceeds. Chosen: two wrong ones may
+# follow each other, and a scale that shows each press once or twice keeps them all.
+AROUND, WRONG_TIMES, WRONG_SHARE = 5, 2.0, 0.02
 # Fewer numbers than this tell no step. If the median number is late by more than a step and by more
 # than this [s], the scale does not print at equal steps.
 LEAST_NUMBERS, MOST_LATE_S = 20, 0.05
@@ -60,7 +66,24 @@ def printed_s(arrival_s: Float) -> Float:
     other times, such as when it is stable, the times stay.
     """
     pauses = np.flatnonzero(np.diff(arrival_s) > SILENCE_S) + 1
-    return np.concatenate([_in_steps(part) for part in np.split(arrival_s, pauses)])
+    parts: list[Float] = []
+    for part in np.split(arrival_s, pauses):
+        times_s = _in_steps(part)
+        if parts:  # numbers that waited for the end of a pause may seem to be from before it
+            first_s = parts[-1][-1] + LEAST_BETWEEN_S
+            times_s = np.maximum(times_s, first_s + LEAST_BETWEEN_S * np.arange(part.size))
+        parts.append(times_s)
+    return np.concatenate(parts)
+
+
+def wrong_numbers(shown_n: Float) -> Bool:
+    """Which numbers of a scale, (m,), no force explains: a damaged line may read as a number."""
+    from scipy.ndimage import median_filter
+
+    around_n = median_filter(shown_n, AROUND, mode="mirror")
+    off_n = np.abs(shown_n - around_n)
+    usual_n = float(np.quantile(off_n, 1 - WRONG_SHARE))
+    return np.asarray(off_n > max(float(np.ptp(around_n)), WRONG_TIMES * usual_n))
 
 
 def _in_steps(arrival_s: Float) -> Float:

@@ -20,7 +20,7 @@ from ohmskin.calibrate.guide import Press, still_wanted
 from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator, Presses, find_presses
 from ohmskin.calibrate.rules import check_cells_differ, check_enough
-from ohmskin.calibrate.scale import printed_s
+from ohmskin.calibrate.scale import printed_s, wrong_numbers
 from ohmskin.calibrate.sessions import beside, check_same, joined, session_paths
 from ohmskin.calibrate.tables import ForceLog, load_force_log, load_press_table
 from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
@@ -317,10 +317,13 @@ def _knead(
     log: forces whose times are by another clock; None: the forces in the recording are taken.
     """
     kneading, offset_s = Kneading(calibrator, given.scans), 0.0
-    lags = log is not None or any(sample.source != WEIGHTS for sample in given.forces)
+    is_apart = log is not None
+    lags = is_apart or any(sample.source != WEIGHTS for sample in given.forces)
     if log is None:
         log = _log_in(given, any_zero=True)
-    else:
+    wrong = wrong_numbers(log.force_n) & lags
+    log = ForceLog(log.time_s[~wrong], log.force_n[~wrong], any_zero=True)
+    if is_apart:
         above = replace(log, force_n=np.maximum(log.force_n - np.quantile(log.force_n, 0.02), 0.0))
         offset_s = align(kneading.time_s, kneading.of_skin, above).offset_s
         log = replace(log, time_s=log.time_s + offset_s, any_zero=True)
@@ -332,6 +335,7 @@ def _knead(
     known = int(np.count_nonzero(~calibration.model.pooled))
     if as_json:
         said = {"left_out": left_out, "lag_s": fit.scale_.lag_s, "offset_s": offset_s}
+        said |= {"wrong_numbers": int(wrong.sum())}
         said |= {"presses": fit.presses, "gain_std": stds.reshape(kneading.shape).tolist()}
         print(json.dumps(said | calibration.nominal_wire_ohm._asdict()))  # noqa: T201
         return
@@ -339,6 +343,9 @@ def _knead(
     TERMINAL.print(f"{fit.presses} presses; {lag}; {len(left_out)} presses left out")
     for begin_s, end_s in left_out:
         TERMINAL.print(f"left out: {begin_s:.1f} to {end_s:.1f} s, force beside the skin?")
+    if wrong.any():
+        text = f"numbers of the scale left out, far from those around them: {wrong.sum()}"
+        TERMINAL.print(text)
     TERMINAL.print(f"{known} of {stds.size} cells have a gain of their own")
     TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator))
     TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}")
