@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """``calibrate knead`` and ``weights --anywhere``: emulated skins, and how near to the truth."""
 
+import os
 import re
 import signal
+from contextlib import AbstractContextManager
 from itertools import islice
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from ohmskin.emulate.scenes import Scene
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan
 from ohmskin.record.recorder import Recorder
-from ohmskin.record.recording import Recording, Tare, load_recording
+from ohmskin.record.recording import ForceSample, Recording, Tare, load_recording
 from stepped import stepped
 
 SKIN = "emulator://2x3?speed=0&rate=20"
@@ -59,11 +61,12 @@ def test_a_skin_is_kneaded_until_every_cell_is_known(run: Run, tmp_path: Path) -
     again = well(run("calibrate", "knead", f"{SKIN}&scene=knead", str(out), *TRUTH))
     assert "touch nothing" not in again.out
     assert not (tmp_path / "skin.knead-2.mcap").exists()
-    # Where that has failed to teach a calibration, more is recorded.
-    out.unlink()
+    # Where that has failed to teach a calibration, more is recorded; an older one may be there.
+    newest_s = (tmp_path / "skin.knead-1.mcap").stat().st_mtime
+    os.utime(out, (newest_s - 60, newest_s - 60))
     again = well(run("calibrate", "knead", f"{SKIN}&scene=knead", str(out), *TRUTH))
     assert "skin.knead-2.mcap: " in again.out
-    assert out.exists()
+    assert out.stat().st_mtime > newest_s
 
 
 def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
@@ -98,6 +101,9 @@ def test_an_early_ctrl_c_is_no_error_and_kneading_goes_on(
         done = well(run(*command))
     assert re.search(r"no calibration is made \(.+\): the same command goes on\n$", done.out)
     assert not out.exists()
+    # A rest that was cut off would be that of all recordings.
+    assert (tmp_path / "skin.knead-1.mcap").exists() == (ends != 20)
+    assert "--rest" not in done.out
     well(run(*command, "--seconds", "11"))
     assert out.exists()
 
@@ -120,10 +126,39 @@ def test_a_rest_during_which_the_scale_moves_is_refused(run: Run, tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
+class TwoBadLines(AbstractContextManager["TwoBadLines"]):
+    """In place of a `ForceSensor`: it never says a force, and two lines could not be read."""
+
+    damaged = 2
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def wait(self) -> None:
+        pass
+
+    def take(self) -> list[ForceSample]:
+        return []
+
+
+def test_lines_of_the_scale_that_could_not_be_read_are_counted(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ohmskin.cli.calibrate.ForceSensor", TwoBadLines)
+    command = ("calibrate", "knead", f"{SKIN}&scene=knead", str(tmp_path / "skin.json"))
+    done = run(*command, "--force-port", "scale", "--seconds", "3")
+    assert "0 forces, 2 lines that could not be read: 0 of 6 cells" in done.out
+
+
 def test_wrong_uses_of_knead(run: Run, tmp_path: Path) -> None:
     out = str(tmp_path / "skin.json")
     knead = ("calibrate", "knead", SKIN, out, "--force-port")
-    assert_one_line(run(*knead, "/dev/ttyNONE"), "no port /dev/ttyNONE")
+    done = run(*knead, "/dev/ttyNONE")
+    assert_one_line(done, "no port /dev/ttyNONE")
+    assert "goes on" not in done.err
     assert_one_line(run(*knead, "truth", "--method", "rsq"), "no method 'rsq'")
     assert list(tmp_path.iterdir()) == []
     done = run(*knead, "truth", "--seconds", "3")

@@ -43,7 +43,7 @@ MOST_POINTS: Final = 40
 
 # A scale that prints nothing for so long has made a pause [s].
 SILENCE_S: Final = 2.0
-# Numbers before and after a pause are so far apart at least [s]. Chosen: less than any scale's step.
+# Numbers before and after a pause are so far apart at least [s]. Chosen: no scale is as fast.
 LEAST_BETWEEN_S: Final = 1e-4
 # Numbers were lost between two windows of so many seconds if the earliest number of the second one
 # is later, by half a step or more, than that of the first [s]. Chosen: no machine is too busy for

@@ -284,7 +284,9 @@ def knead(
 
     given, known = kneaded(port, out, sensor_of, seconds)
     try:
-        _learn_totals(calibrator_of, given, out)
+        if not any(each.scans and each.tares for each in given):
+            raise ValueError("no recording has a rest, and touches after it")
+        _learn_totals(calibrator_of, joined(given), out)
     except ValueError as exc:
         if known or seconds:
             raise

@@ -15,9 +15,9 @@ from rich.text import Text
 import ohmskin
 from ohmskin.calibrate.coverage import KNOWN_LOG, LEAST_N, LiveCoverage
 from ohmskin.calibrate.rules import check_complete
-from ohmskin.calibrate.sessions import check_same, joined, session_paths
+from ohmskin.calibrate.sessions import check_same, session_paths
 from ohmskin.cli.board import TERMINAL, asked_for
-from ohmskin.cli.record import FORCE_TARE_S, with_truth
+from ohmskin.cli.record import FORCE_TARE_S, unread, with_truth
 from ohmskin.cli.stream import cell_table
 from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.errors import DeviceLost, TareRefused
@@ -34,11 +34,15 @@ _SAY_EVERY_S: Final = 10.0
 
 
 class KneadMap:
-    """How well each cell is known, in the terminal, while it is recorded."""
+    """How well each cell is known, in the terminal, while it is recorded.
+
+    has_rest: whether the rest was measured to its end, and the scale stood still meanwhile.
+    """
 
     def __init__(self, recorder: Recorder, coverage: LiveCoverage) -> None:
         self._recorder, self._coverage = recorder, coverage
         self._said_s = self._began_s = recorder.now_s()
+        self.has_rest = False
 
     def look(self, scan: Scan) -> None:
         """Look at a scan that was recorded. Without a terminal, say now and then what is known.
@@ -50,6 +54,7 @@ class KneadMap:
         if self._recorder.tare is not None and moved_n > LEAST_N:
             remedy = "touch nothing for the first seconds, and say it again"
             raise TareRefused(f"the force moved by {moved_n:.1f} N at rest", remedy)
+        self.has_rest = self._recorder.tare is not None
         if not TERMINAL.is_terminal and scan.host_time_s - self._said_s >= _SAY_EVERY_S:
             self._said_s = scan.host_time_s
             TERMINAL.print(f"{scan.host_time_s - self._began_s:.0f} s: {self.words()}")
@@ -77,11 +82,11 @@ class KneadMap:
 
 def kneaded(
     port: str, out: Path, sensor_of: Callable[[Device], ForceSensor | None], seconds: float
-) -> tuple[Recording, bool]:
+) -> tuple[list[Recording], bool]:
     """What was kneaded before, and now, until all cells are known or Ctrl-C comes.
 
-    sensor_of: opens the force sensor; None: the skin knows the truth. Returns all recordings as
-    one, and whether all cells are known.
+    sensor_of: opens the force sensor; None: the skin knows the truth. Returns all recordings, and
+    whether all cells are known.
     """
     before, path = session_paths(out, "knead")
     recordings = [load_recording(each) for each in before]
@@ -92,24 +97,32 @@ def kneaded(
         coverage = LiveCoverage(skin.info)
         for given in recordings:
             coverage.look_at(given)
-        if coverage.known.all() and not out.exists():  # the fit has failed
+        if coverage.known.all() and not _is_newer(out, before):  # the fit has failed
             coverage.ask_more()
         if not coverage.known.all():
             try:
-                _knead(skin, path, sensor_of(skin), coverage, seconds)
+                goes_on = _knead(skin, path, sensor_of(skin), coverage, seconds)
             except TareRefused:
                 path.unlink()
                 raise
             except DeviceLost as exc:
+                if not path.exists():
+                    raise
                 raise DeviceLost(f"{exc} (the same command goes on from {path})") from exc
-            recordings.append(load_recording(path))
-    return joined(recordings), bool(coverage.known.all())
+            recordings += [load_recording(path)] if goes_on else []
+    return recordings, bool(coverage.known.all())
+
+
+def _is_newer(out: Path, recordings: list[Path]) -> bool:
+    """Whether a calibration is there that was written after these recordings."""
+    written_ns = [path.stat().st_mtime_ns for path in recordings]
+    return out.exists() and out.stat().st_mtime_ns >= max(written_ns, default=0)
 
 
 def _knead(
     skin: Device, path: Path, sensor: ForceSensor | None, coverage: LiveCoverage, seconds: float
-) -> None:
-    """Record while somebody kneads."""
+) -> bool:
+    """Record while somebody kneads. Returns whether it went on after the rest was measured."""
     coverage.begin()
     with ExitStack() as stack:
         if sensor is not None:
@@ -130,4 +143,10 @@ def _knead(
         recording.record(
             skin, recorder, unknown, tare_s=FORCE_TARE_S, sensor=sensor, beside=shown.look
         )
-    TERMINAL.print(f"{path}: {recorder.scans} scans, {recorder.forces} forces: {shown.words()}")
+    read = f"{recorder.scans} scans, {recorder.forces} forces{unread(sensor)}"
+    if not shown.has_rest:
+        path.unlink()
+        TERMINAL.print(f"{read}: it ended while the rest was measured, and nothing is kept")
+        return False
+    TERMINAL.print(f"{path}: {read}: {shown.words()}")
+    return True

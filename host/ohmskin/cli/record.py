@@ -126,9 +126,14 @@ def record(
     done = f"{recorder.scans} scans, missed {recorder.missed}, {recorder.size} bytes"
     if force_port:
         done += f", {recorder.forces} forces"
-    if sensor is not None and sensor.damaged:
-        done += f", {sensor.damaged} lines that could not be read"
-    TERMINAL.print(f"{file}: {done}")
+    TERMINAL.print(f"{file}: {done}{unread(sensor)}")
+
+
+def unread(sensor: ForceSensor | None) -> str:
+    """A clause about lines of a force sensor that could not be read; none if there are none."""
+    if sensor is None or not sensor.damaged:
+        return ""
+    return f", {sensor.damaged} lines that could not be read"
 
 
 def is_truth(force_port: str, skin: Device) -> bool:

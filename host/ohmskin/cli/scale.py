@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from ohmskin.calibrate.guide import MIN_READING_SCANS, READING_S, steady
 from ohmskin.cli.board import TERMINAL
-from ohmskin.cli.record import ForceBaud, ForceColumn, ForceUnit
+from ohmskin.cli.record import ForceBaud, ForceColumn, ForceUnit, unread
 from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
 from ohmskin.record.recording import ForceSample
 
@@ -50,13 +50,16 @@ def scale(
         sensor.wait()
         empty = _shown(sensor, "take off what is not always on it")
         shown = np.array([_shown(sensor, f"put {g:g} g on it, alone", empty) for g in masses_g])
+        lost = unread(sensor)
     forces_n = NEWTONS["g"] * np.array(masses_g)
     factor = float(forces_n @ shown / max(shown @ shown, 1e-300))
     off = np.abs(factor * shown / forces_n - 1)
     if not off.max() <= _OFF_SHARE:
         each = ", ".join(f"{g:g} g: {x:.6g}" for g, x in zip(masses_g, shown, strict=True))
         raise ValueError(f"the weights disagree by {100 * off.max():.0f} % ({each}): weigh again")
-    TERMINAL.print(f"--force-scale {factor:.6g} (the weights agree within {100 * off.max():.1f} %)")
+    TERMINAL.print(
+        f"--force-scale {factor:.6g} (the weights agree within {100 * off.max():.1f} %){lost}"
+    )
 
 
 def _shown(sensor: ForceSensor, wish: str, empty: float | None = None) -> float:
