@@ -162,6 +162,32 @@ def test_a_clock_that_jumps_takes_no_memory() -> None:
     assert found.presses == 40
 
 
+def test_presses_during_which_the_scale_was_silent_do_not_count() -> None:
+    time_s, press, force_n = presses(2, 40)
+    none, rise = np.zeros_like(time_s), rises(force_n, np.ones(force_n.shape[1]))
+    shown = time_s < 12.0
+    of_skin, of_scale = (time_s, rise, press, none), (time_s[shown], force_n.sum(axis=1)[shown])
+    assert TotalFit(Totals(*of_skin, *of_scale)).presses == 20
+    few = (of_scale[0][:100], of_scale[1][:100])
+    with pytest.raises(ValueError, match="fewer than 5 presses of the skin while it was weighed"):
+        TotalFit(Totals(*of_skin, *few))
+
+
+def test_what_is_left_out_ends_at_a_gap_and_pauses_are_no_presses() -> None:
+    time_s, press, force_n = presses(2, 60)
+    rest_s = np.arange(0.0, 3.0, STEP_S)  # at the end, in which something is beside the skin
+    time_s = np.concatenate([time_s, 36.0 + rest_s, 139.0 + rest_s])
+    zeros = np.zeros((2 * rest_s.size, force_n.shape[1]))
+    force_n = np.concatenate([force_n, zeros])
+    press = np.concatenate([press, np.full(2 * rest_s.size, -1)])
+    shown_n = force_n.sum(axis=1) + 5.0 * ((time_s > 139.5) & (time_s < 141.5))
+    shown_n += 0.01 * np.random.default_rng(4).standard_normal(time_s.size)
+    rise = rises(force_n, np.ones(force_n.shape[1]))
+    found = TotalFit(Totals(time_s, rise, press, np.zeros_like(time_s), time_s, shown_n)).fit()
+    assert found.left_out == [pytest.approx((139.0, 142.0), abs=0.1)]
+    assert (found.presses, found.presses_left_out) == (60, 0)
+
+
 @pytest.fixture(scope="module")
 def fit() -> tuple[TotalFit, Float, list[int]]:
     """Of a slow scale with a zero; every twelfth press is beside the skin, too."""

@@ -67,6 +67,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.rules import MIN_PRESSES
 from ohmskin.calibrate.scale import EARLIEST_S, Scale, fit_scale
+from ohmskin.calibrate.tables import GAP_S, GAP_STEPS
 from ohmskin.force.curve import MAX_EXPONENT, MIN_EXPONENT, POWER, ForceModel
 
 # Standard deviation of the log gains of cells, before any press. Chosen: cells of one skin scatter
@@ -187,8 +188,7 @@ class TotalFit:
         offsets = 0 if wires is None else wires.centre.size
         self.scale_ = scale or Scale()
         self._on = (totals.rise > 0) & (totals.press >= 0)[:, None]
-        if np.unique(totals.press[self._on.any(axis=1)]).size < MIN_PRESSES:
-            raise ValueError(f"fewer than {MIN_PRESSES} presses of the skin while it was weighed")
+        _check_enough(np.unique(totals.press[self._on.any(axis=1)]).size)
         self._unit = float(np.exp(np.mean(np.log(totals.rise[self._on]))))  # x0
         self._hard = float(np.quantile(totals.rise[self._on], HARD_QUANTILE))
         self._log_x = np.log(np.where(self._on, totals.rise, self._unit) / self._unit)
@@ -203,6 +203,7 @@ class TotalFit:
         self._p[1:3] = EXPONENT, SERIES
         self._gain_std = FIRST_GAIN_STD
         self._group()
+        _check_enough(np.count_nonzero(self._is_press))
         self._out: Bool = np.zeros(self._groups, dtype=bool)
 
     def _set_zero(self) -> None:
@@ -220,16 +221,23 @@ class TotalFit:
         self._zero_precision = steps.T @ steps + 1e-6 * np.eye(knots_s.size)
 
     def _group(self) -> None:
-        """Which press, or pause between presses, each row is of, after the scale's lag."""
+        """Which press, or pause between presses, each row is of, after the scale's lag.
+
+        Both end at a gap of the scans.
+        """
         totals = self._totals
-        number = np.cumsum(np.diff(totals.press, prepend=totals.press[0]) != 0)
+        steps_s = np.diff(totals.time_s, prepend=totals.time_s[0])
+        is_gap = steps_s > max(GAP_S, GAP_STEPS * float(np.median(steps_s)))
+        changes = np.diff(totals.press, prepend=totals.press[0]) != 0
+        number = np.cumsum(changes | (is_gap & totals.lags))
         scan = np.searchsorted(totals.time_s, totals.shown_s - self.scale_.lag_s)
         scan = scan.clip(0, totals.time_s.size - 1)
         self._of_scan, self._of_row, self._groups = number, number[scan], int(number[-1]) + 1
         pressed = totals.press >= 0
         near = np.convolve(pressed, np.ones(2 * NEAR_SCANS + 1), "same") > 0
         self._pressed, self._ends = pressed[scan], near[scan] & ~pressed[scan]
-        self._is_press = np.bincount(number, totals.press >= 0) > 0
+        is_weighed = np.bincount(self._of_row, minlength=self._groups) > 0
+        self._is_press = is_weighed & (np.bincount(number, totals.press >= 0) > 0)
 
     def _contact(self) -> tuple[Float, Float, Float]:
         """log(x' / x0), and its slopes by log x and by c, each (n, C)."""
@@ -376,6 +384,8 @@ class TotalFit:
         s0 = _robust_std(off[pauses], 0.01) if pauses.sum() > 5 else 0.01
         stds = off / np.hypot(s0, np.where(self._is_press, s1 * scale_n, 0.0))
         if not trims:
+            if not presses.any():
+                raise ValueError(STRANGE)
             most = np.quantile(stds[presses], SURE_SHARE)
             self._out = stds > np.where(self._is_press, most, OUTLIER_STDS)
             return
@@ -399,6 +409,11 @@ class TotalFit:
     def presses(self) -> int:
         """How many presses were learned from."""
         return int(np.count_nonzero(self._is_press & ~self._out))
+
+    @property
+    def presses_left_out(self) -> int:
+        """How many presses were not; `left_out` has pauses, too."""
+        return int(np.count_nonzero(self._is_press & self._out))
 
     @property
     def left_out(self) -> list[tuple[float, float]]:
@@ -463,6 +478,11 @@ class TotalFit:
         good = self._pressed & ~self._out[self._of_row] & (size_n > 0.25 * size_n.max())
         by_play = self._p[1] * self._p[3]
         return float(np.sqrt(np.mean((self.off_n_[good] / size_n[good]) ** 2) + by_play**2))
+
+
+def _check_enough(presses: int) -> None:
+    if presses < MIN_PRESSES:
+        raise ValueError(f"fewer than {MIN_PRESSES} presses of the skin while it was weighed")
 
 
 def _turns(log_x: Float, on: Bool) -> Float:

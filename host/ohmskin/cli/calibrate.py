@@ -342,7 +342,8 @@ def _knead(
         print(json.dumps(said | calibration.nominal_wire_ohm._asdict()))  # noqa: T201
         return
     lag = f"the scale lags by {1000 * fit.scale_.lag_s:.0f} ms"
-    TERMINAL.print(f"{fit.presses} presses; {lag}; {len(left_out)} presses left out")
+    fewer = f"{_presses(fit.presses_left_out)} left out"
+    TERMINAL.print(f"{_presses(fit.presses)}; {lag}; {fewer}")
     for begin_s, end_s in left_out:
         TERMINAL.print(f"left out: {begin_s:.1f} to {end_s:.1f} s, force beside the skin?")
     if wrong.any():
@@ -351,6 +352,10 @@ def _knead(
     TERMINAL.print(f"{known} of {stds.size} cells have a gain of their own")
     TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator))
     TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}")
+
+
+def _presses(count: int) -> str:
+    return "1 press" if count == 1 else f"{count} presses"
 
 
 @calibrate.command()
