@@ -37,6 +37,8 @@ def test_it_prints_as_scales_do() -> None:
 
 
 def test_noise_is_that_of_the_option() -> None:
+    with pytest.raises(ValueError, match="and its noise 0 to 1000000 g"):
+        EmulatedScale(lambda _: 3.0, noise_g=-1)
     seen_n = numbers(EmulatedScale(lambda _: 3.0, lag_s=0, noise_g=5, seed=1), 300.0)
     assert np.std(seen_n) == pytest.approx(5 * 0.00980665, rel=0.05)
     assert np.mean(seen_n) == pytest.approx(3.0, abs=0.005)

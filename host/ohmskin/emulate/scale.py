@@ -49,7 +49,10 @@ class EmulatedScale:
         seed: int = 0,
     ) -> None:
         if not (0.1 <= rate_hz <= 1000 and 0 <= lag_s <= 10 and 0 <= noise_g <= 1e6):
-            raise ValueError("a scale prints 0.1 to 1000 numbers a second, its lag is up to 10 s")
+            raise ValueError(
+                "a scale prints 0.1 to 1000 numbers a second, its lag is 0 to 10 s, and its noise "
+                "0 to 1000000 g"
+            )
         self._force_n, self._noise_g = force_n, noise_g
         self._step_s = 1.0 / (rate_hz * _STEPS)
         self._keep = math.exp(-self._step_s / lag_s) if lag_s else 0.0
