@@ -269,6 +269,7 @@ LOG = ForceLog(TIME_S, FORCE_N)
         ),
         (TIME_S, np.full(1500, 1e-6), LOG, "the skin's rise does not rise: nothing was pressed"),
         (TIME_S, -FORCE_N, LOG, "the skin's rise does not rise: nothing was pressed"),
+        (TIME_S, np.eye(1500)[700], LOG, "the skin's rise rises during less than 1 % of the time"),
         (TIME_S / 100, FORCE_N, LOG, "the skin's rise lasts 0.3 s, 15 s are needed"),
         (TIME_S, FORCE_N, ForceLog(TIME_S / 4, FORCE_N), "the force lasts 7.5 s, 15 s are"),
         (TIME_S * MAX_SPAN_S / 20, FORCE_N, LOG, "the skin's rise lasts 9.0 h, more than 6"),

@@ -126,8 +126,13 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, Bool]:
     if span_s > MAX_SPAN_S:
         raise ValueError(f"{name} lasts {span_s / 3600:.1f} h, more than 6: cut it into parts")
     strong = float(np.percentile(values, 99))
-    if values.min() == values.max() or strong <= 0:
+    if values.min() == values.max() or values.max() <= 0:
         raise ValueError(f"{name} does not rise: nothing was pressed")
+    if strong <= 0:
+        raise ValueError(
+            f"{name} rises during less than 1 % of the time: cut away what is before and after the "
+            "presses, or press more often"
+        )
     # A sensor's glitch counts no more than a press twice as strong as all others.
     compressed = np.log1p(np.clip(values, 0.0, 2 * strong) / (COMPRESSION_SHARE * strong))
     grid_s = np.arange(int(span_s / GRID_STEP_S) + 1) * GRID_STEP_S
