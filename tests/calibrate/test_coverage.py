@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What kneading shows of each cell, against fits of many simulated skins."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,17 @@ def test_a_recording_is_looked_at_as_it_was_live(tmp_path: Path) -> None:
     assert later.next_cell == np.unravel_index(later.log_std.argmax(), (2, 3))
     assert (later.known == (later.log_std <= 0.15)).all()
     assert not live.known.any()  # it has seen some presses alone
+
+
+def test_a_scale_that_is_upside_down_is_noticed(tmp_path: Path) -> None:
+    """No number counted, and whoever kneaded waited for ever."""
+    recording = record_kneading(tmp_path / "a.mcap", 12.0, 1)
+    live = LiveCoverage(recording.hellos[0])
+    live.look_at(recording)
+    assert not live.is_upside_down
+    recording.forces = [replace(force, force_n=-force.force_n) for force in recording.forces]
+    live.look_at(recording)
+    assert live.is_upside_down
 
 
 def test_recordings_are_joined_on_one_clock_and_zero(tmp_path: Path) -> None:

@@ -153,6 +153,40 @@ def test_lines_of_the_scale_that_could_not_be_read_are_counted(
     assert "0 forces, 2 lines that could not be read: 0 of 6 cells" in done.out
 
 
+class Weighing(TwoBadLines):
+    """In place of a `ForceSensor`, ten numbers a second: at first, something is lifted off it."""
+
+    on_it, lifted, now_s = 0.0, 0.0, 0.0
+
+    def take(self) -> list[ForceSample]:
+        self.now_s += 0.1
+        left = max(0.0, self.lifted - 300 * self.now_s)
+        return [ForceSample(self.on_it + left, self.now_s)]
+
+
+@pytest.mark.parametrize(
+    ("lifted", "words"),
+    [
+        (0.0, "(the weights agree within 0.0 %), 2 lines that could not be read"),
+        (500.0, "without a weight, its numbers moved by 165: weigh again"),
+    ],
+)
+def test_a_scale_is_empty_and_still_before_weights_are_put_on_it(
+    run: Run, monkeypatch: pytest.MonkeyPatch, lifted: float, words: str
+) -> None:
+    def prompt(text: str, **_: object) -> str:
+        mass_g = re.search(r"put (\d+) g", text)
+        Weighing.on_it = float(mass_g[1]) if mass_g else 0.0
+        return ""
+
+    monkeypatch.setattr("typer.prompt", prompt)
+    monkeypatch.setattr(Weighing, "on_it", 0.0)
+    monkeypatch.setattr(Weighing, "lifted", lifted)
+    monkeypatch.setattr("ohmskin.cli.scale.ForceSensor", Weighing)
+    done = run("calibrate", "scale", "load cell", "--grams", "200,500")
+    assert words in done.out + done.err
+
+
 def test_wrong_uses_of_knead(run: Run, tmp_path: Path) -> None:
     out = str(tmp_path / "skin.json")
     knead = ("calibrate", "knead", SKIN, out, "--force-port")
@@ -205,6 +239,9 @@ def test_the_map_shows_each_cell_and_where_to_press_next(
         console.print(shown.picture())
         recorder.add(Tare(np.full((2, 3, 4), 0.5), 1.0))
         console.print(shown.picture())
+    with monkeypatch.context() as patch:
+        patch.setattr(LiveCoverage, "is_upside_down", True)
+        assert shown.words().endswith("turn the sign of --force-scale")
     lines = [line.split() for line in got.get().splitlines()]
     assert ["touch", "nothing", "yet"] in lines
     assert "3 of 6 cells are known to 15 %, press at row 1, column 1" in got.get()

@@ -62,6 +62,9 @@ NEWS_S: Final = 0.1
 NUMBERS_A_CELL: Final = 10
 # A smaller force is not counted [N]. Chosen: the error of a scale's zero is a large share of it.
 LEAST_N: Final = 0.3
+# So many numbers below zero during touches, and more than above zero, show a scale whose sign is
+# wrong. Chosen: the first touches tell it, and one bad zero does not.
+LEAST_BELOW: Final = 20
 
 
 class Coverage:
@@ -80,12 +83,16 @@ class Coverage:
 
     def add(self, time_s: float, rise: Float, force_n: float) -> None:
         """One number of the scale: when [s], the rise of touched cells (N,) [S], the force [N]."""
-        self._last_s = time_s
+        self.pass_over(time_s)
         self.numbers += 1
         share = np.maximum(rise, 0.0) ** USUAL_EXPONENT
         share /= share.sum()
         variance = CONTACT_STD**2 + (SCALE_STD_N / force_n) ** 2
         self._information += np.outer(share, share) / variance
+
+    def pass_over(self, time_s: float) -> None:
+        """A number of then [s] that tells nothing of the cells."""
+        self._last_s = time_s
 
     def log_std(self) -> Float:
         """Deviation of t of each cell, (N,)."""
@@ -114,6 +121,7 @@ class LiveCoverage:
     def begin(self) -> None:
         """Another recording begins: its rest and the zero of its scale are its own."""
         self._zeros_n: list[float] = []
+        self._below, self._above = 0, 0  # numbers of the scale during touches, by their sign
         self._estimator: Estimator | None = None
 
     def look(self, scan: Scan, tare: Tare | None, sample: ForceSample | None) -> bool:
@@ -129,12 +137,17 @@ class LiveCoverage:
             knowledge = SkinKnowledge.of(self._board, tare.rest_ratio)
             self._estimator = make_estimator(DEFAULT_METHOD, replace(knowledge, may_be_bent=False))
         force_n = sample.force_n - float(np.median(self._zeros_n or [0.0]))
-        if not self._coverage.is_news(sample.host_time_s, force_n):
+        if not self._coverage.is_news(sample.host_time_s, abs(force_n)):
             return False
         frame = self._estimator.estimate(scan.ratio)
         rise = np.where(frame.touched, frame.level - self._estimator.rest_level(), 0.0)
         if not (rise > 0).any():
             return False
+        if force_n < 0:
+            self._below += 1
+            self._coverage.pass_over(sample.host_time_s)
+            return False
+        self._above += 1
         self._coverage.add(sample.host_time_s, rise.ravel(), force_n)
         self.log_std = self._coverage.log_std().reshape(self.log_std.shape)
         return True
@@ -155,6 +168,11 @@ class LiveCoverage:
         """By how much the scale moved while the rest was measured [N]."""
         least, most = np.quantile(self._zeros_n or [0.0], [0.1, 0.9]).tolist()
         return float(most - least)
+
+    @property
+    def is_upside_down(self) -> bool:
+        """Whether the scale shows less, not more, where this recording's touches press it."""
+        return self._below > max(LEAST_BELOW, self._above)
 
     @property
     def known(self) -> Bool:

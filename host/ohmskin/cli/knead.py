@@ -61,6 +61,8 @@ class KneadMap:
 
     def words(self) -> str:
         """A line: how many cells are known, and where to press next."""
+        if self._coverage.is_upside_down:
+            return "the force falls where the skin is pressed: turn the sign of --force-scale"
         known = self._coverage.known
         row, column = self._coverage.next_cell
         text = f"{known.sum()} of {known.size} cells are known to {100 * KNOWN_LOG:.0f} %"

@@ -48,9 +48,12 @@ def scale(
     masses_g = grams_of(grams, least=2)
     with ForceSensor(port, force_baud, 1.0, force_unit, force_column) as sensor:
         sensor.wait()
-        empty = _shown(sensor, "take off what is not always on it")
-        shown = np.array([_shown(sensor, f"put {g:g} g on it, alone", empty) for g in masses_g])
+        empty, moved = _shown(sensor, "take off what is not always on it")
+        asked = (_shown(sensor, f"put {g:g} g on it, alone", empty) for g in masses_g)
+        shown = np.array([number for number, _ in asked])
         lost = unread(sensor)
+    if moved > _OFF_SHARE * np.abs(shown).min():
+        raise ValueError(f"without a weight, its numbers moved by {moved:.6g}: weigh again")
     forces_n = NEWTONS["g"] * np.array(masses_g)
     factor = float(forces_n @ shown / max(shown @ shown, 1e-300))
     off = np.abs(factor * shown / forces_n - 1)
@@ -62,8 +65,12 @@ def scale(
     )
 
 
-def _shown(sensor: ForceSensor, wish: str, empty: float | None = None) -> float:
-    """Mean number above that of the empty scale when the wish is fulfilled, and it is steady."""
+def _shown(sensor: ForceSensor, wish: str, empty: float | None = None) -> tuple[float, float]:
+    """Mean number above that of the empty scale when the wish is fulfilled, and it is steady.
+
+    empty: the empty scale's number; None: it is empty, and any change counts as steady, because
+    only weights show which one is large. Returns also by how much the number moved meanwhile.
+    """
     typer.prompt(f"{wish}, then press Enter", default="", show_default=False, prompt_suffix="")
     sensor.take()
     window: deque[ForceSample] = deque()
@@ -74,5 +81,7 @@ def _shown(sensor: ForceSensor, wish: str, empty: float | None = None) -> float:
         if len(window) >= MIN_READING_SCANS and long_s >= READING_S:
             numbers = np.array([sample.force_n for sample in window]) - (empty or 0.0)
             if empty is None or steady(numbers)[1]:
-                return float(numbers.mean())
+                half = numbers.size // 2
+                moved = abs(float(numbers[half:].mean() - numbers[:half].mean()))
+                return float(numbers.mean()), moved
             window.clear()
