@@ -60,6 +60,11 @@ from ohmskin.record.recording import Recording, Tare, load_recording
 # enough to let go.
 COUNT_DOWN_S: Final = 3
 
+# The alignment of a log takes the scale's lag for a part of the offset, so that a slow scale seems
+# to show a force before it comes. So the log is taken to be late by so much [s]. Chosen: it is what
+# the alignment takes of the lag of a slow one, because it goes by the edges.
+ALIGNED_LAG_S: Final = 0.15
+
 Out = Annotated[Path, Argument(help="calibration file to write (.json)")]
 Method = Annotated[str, Option(help=" | ".join(LEVEL_METHODS))]
 Indenter = Annotated[
@@ -318,7 +323,7 @@ def _knead(
 
     log: forces whose times are by another clock; None: the forces in the recording are taken.
     """
-    kneading, offset_s = Kneading(calibrator, given.scans), 0.0
+    kneading, offset_s, late_s = Kneading(calibrator, given.scans), 0.0, 0.0
     is_apart = log is not None
     lags = is_apart or any(sample.source != WEIGHTS for sample in given.forces)
     if log is None:
@@ -328,20 +333,22 @@ def _knead(
     if is_apart:
         above = replace(log, force_n=np.maximum(log.force_n - np.quantile(log.force_n, 0.02), 0.0))
         offset_s = align(kneading.time_s, kneading.of_skin, above).offset_s
-        log = replace(log, time_s=log.time_s + offset_s, any_zero=True)
+        late_s = ALIGNED_LAG_S
+        log = replace(log, time_s=log.time_s + offset_s + late_s, any_zero=True)
     fit = kneading.learn(log, progress("scans"), lags=lags)
+    lag_s = fit.scale_.lag_s - late_s
     calibration = calibrator.calibration_of(fit.model(kneading.shape), fit.largest_n)
     calibration.save(out)
     first_s, stds = kneading.time_s[0], fit.gain_std()
     left_out = [[begin - first_s, end - first_s] for begin, end in fit.left_out]
     known = int(np.count_nonzero(~calibration.model.pooled))
     if as_json:
-        said = {"left_out": left_out, "lag_s": fit.scale_.lag_s, "offset_s": offset_s}
+        said = {"left_out": left_out, "lag_s": lag_s, "offset_s": offset_s}
         said |= {"wrong_numbers": int(wrong.sum())}
         said |= {"presses": fit.presses, "gain_std": stds.reshape(kneading.shape).tolist()}
         print(json.dumps(said | calibration.nominal_wire_ohm._asdict()))  # noqa: T201
         return
-    lag = f"the scale lags by {1000 * fit.scale_.lag_s:.0f} ms"
+    lag = f"the scale lags by {1000 * lag_s:.0f} ms"
     fewer = f"{_presses(fit.presses_left_out)} left out"
     TERMINAL.print(f"{_presses(fit.presses)}; {lag}; {fewer}")
     for begin_s, end_s in left_out:
