@@ -203,7 +203,7 @@ class TotalFit:
         self._p[1:3] = EXPONENT, SERIES
         self._gain_std = FIRST_GAIN_STD
         self._group()
-        _check_enough(np.count_nonzero(self._is_press))
+        _check_enough(int(np.count_nonzero(self._is_press)))
         self._out: Bool = np.zeros(self._groups, dtype=bool)
 
     def _set_zero(self) -> None:
