@@ -51,8 +51,11 @@ def test_the_simulator_says_which_forces_a_scan_has_read() -> None:
         assert skin.true_force_n is not None
         force_n = np.array([skin.true_force_n(scan) for scan in scans])
     peaks_n = set()
-    for before, now, after, scan in zip(force_n, force_n[1:], force_n[2:], scans[1:], strict=False):
-        if now.any() and (before == now).all() and (now == after).all():  # it does not change
+    # Two scans on either side have the same forces: on a busy machine, a change that is said to be
+    # of one scan may have come amid the scan before it.
+    around_n = np.lib.stride_tricks.sliding_window_view(force_n, 5, axis=0)
+    for near_n, now, scan in zip(around_n, force_n[2:], scans[2:], strict=False):
+        if now.any() and (near_n == now[..., None]).all():  # it does not change
             peaks_n.add(now.max())
             same_skin.put(((0, 0), now[0, 0]))  # the robot presses this cell for 4 s
             np.testing.assert_allclose(scan.codes, quantise(same_skin.ratio(0.0)), rtol=0, atol=1)
