@@ -36,7 +36,7 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.presses import Calibrator, Progress, number_presses
-from ohmskin.calibrate.tables import GAP_S, GAP_STEPS, ForceLog
+from ohmskin.calibrate.tables import ForceLog, gaps
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.calibrate.wires import FoundWires, wire_prior
 from ohmskin.circuit.skin import PortCircuit
@@ -228,8 +228,7 @@ class Kneading:
 
     def _unseen(self, at_s: Float) -> Bool:
         """Whether what the scale shows then, (m,) [s], may be of a gap of the scans."""
-        steps_s = np.diff(self.time_s)
-        before = np.flatnonzero(steps_s > max(GAP_S, GAP_STEPS * float(np.median(steps_s))))
+        before = np.flatnonzero(gaps(self.time_s))
         begun = np.searchsorted(self.time_s[before], at_s)
         until_s = np.concatenate([[-np.inf], self.time_s[before + 1] + AFTER_GAP_S])
         return np.asarray(at_s < until_s[begun])

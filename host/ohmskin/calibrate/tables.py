@@ -34,7 +34,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ohmskin.arrays import Float
+from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.rules import require_forces, require_rows
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.files import PathName, naming, read_bounded, save_table
@@ -123,15 +123,19 @@ class ForceLog:
 def between_gaps(at_s: ArrayLike, time_s: Float, values: Float) -> Float:
     """`values` (n,) of increasing times `time_s` (n,), interpolated at `at_s` of any shape.
 
-    NaN outside of `time_s`, and inside its gaps: steps above `GAP_S` and `GAP_STEPS` median steps.
+    NaN outside of `time_s`, and inside its gaps (`gaps`).
     """
     at_s = np.asarray(at_s, dtype=np.float64)
     interpolated = np.asarray(np.interp(at_s, time_s, values, left=np.nan, right=np.nan))
-    steps_s = np.diff(time_s)
-    is_gap = (steps_s > GAP_S) & (steps_s > GAP_STEPS * np.median(steps_s))
     after = np.searchsorted(time_s, at_s).clip(1, time_s.size - 1)
     inside = (at_s > time_s[after - 1]) & (at_s < time_s[after])
-    return np.where(inside & is_gap[after - 1], np.nan, interpolated)
+    return np.where(inside & gaps(time_s)[after - 1], np.nan, interpolated)
+
+
+def gaps(time_s: Float) -> Bool:
+    """Which steps of times (n,) are gaps, (n-1,): above `GAP_S` and `GAP_STEPS` median steps."""
+    steps_s = np.diff(time_s)
+    return np.asarray((steps_s > GAP_S) & (steps_s > GAP_STEPS * np.median(steps_s)))
 
 
 def load_force_log(path: PathName, *, any_zero: bool = False) -> ForceLog:

@@ -67,7 +67,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.rules import MIN_PRESSES
 from ohmskin.calibrate.scale import EARLIEST_S, Scale, fit_scale
-from ohmskin.calibrate.tables import GAP_S, GAP_STEPS
+from ohmskin.calibrate.tables import gaps
 from ohmskin.force.curve import MAX_EXPONENT, MIN_EXPONENT, POWER, ForceModel
 
 # Standard deviation of the log gains of cells, before any press. Chosen: cells of one skin scatter
@@ -226,10 +226,10 @@ class TotalFit:
         Both end at a gap of the scans.
         """
         totals = self._totals
-        steps_s = np.diff(totals.time_s, prepend=totals.time_s[0])
-        is_gap = steps_s > max(GAP_S, GAP_STEPS * float(np.median(steps_s)))
-        changes = np.diff(totals.press, prepend=totals.press[0]) != 0
-        number = np.cumsum(changes | (is_gap & totals.lags))
+        ends = np.diff(totals.press) != 0
+        if totals.lags:
+            ends |= gaps(totals.time_s)
+        number = np.concatenate([[0], np.cumsum(ends)])
         scan = np.searchsorted(totals.time_s, totals.shown_s - self.scale_.lag_s)
         scan = scan.clip(0, totals.time_s.size - 1)
         self._of_scan, self._of_row, self._groups = number, number[scan], int(number[-1]) + 1
