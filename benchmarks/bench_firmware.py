@@ -67,7 +67,8 @@ from desk import near_admittance
 from lockstep import BOARDS, CPU_HZ, Rig, elf_of
 from modes_and_regions import measure_modes, measure_modes_second  # beside this file
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READING_SIGN, Skin, all_readings, end_admittance
+from ohmskin.circuit.configurations import READING_SIGN
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance
 from ohmskin.emulate.scenes import Scene
 from ohmskin.emulate.simavr import SimavrLink
 from ohmskin.link import protocol

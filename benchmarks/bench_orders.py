@@ -34,14 +34,8 @@ from bars import QUICK, options  # beside this file
 from desk import near_admittance  # tests/helpers
 from lockstep import Rig
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import (
-    READING_OFFSET,
-    READING_SIGN,
-    Skin,
-    all_readings,
-    end_admittance,
-    readings,
-)
+from ohmskin.circuit.configurations import READING_OFFSET, READING_SIGN
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from ohmskin.link import protocol
 from places import ROOT
 

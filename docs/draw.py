@@ -26,7 +26,7 @@ sys.path[:0] = [str(ROOT / "host"), str(DOCS)]
 
 import draw_wiring  # noqa: E402
 
-from ohmskin.circuit.skin import current_std  # noqa: E402
+from ohmskin.circuit.configurations import current_std  # noqa: E402
 from ohmskin.link import framing, protocol  # noqa: E402
 from ohmskin.link.codes import ADC_BITS, ratio_std  # noqa: E402
 

@@ -19,13 +19,8 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import (
-    READING_OFFSET,
-    READING_SENSES_TOP,
-    READINGS_PER_CELL,
-    Skin,
-    readings,
-)
+from ohmskin.circuit.configurations import READING_OFFSET, READING_SENSES_TOP, READINGS_PER_CELL
+from ohmskin.circuit.skin import Skin, readings
 from ohmskin.emulate.faults import SkinFaults, joined_readings
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS

@@ -15,7 +15,7 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READINGS_PER_CELL
+from ohmskin.circuit.configurations import READINGS_PER_CELL
 from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.estimate.methods import VOLTAGE, make_estimator
 from ohmskin.estimate.ohm import voltage_level

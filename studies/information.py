@@ -34,7 +34,8 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit, Skin
+from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.prior import (
     LAYER_STD,

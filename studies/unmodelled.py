@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READINGS_PER_CELL, Skin, readings
+from ohmskin.circuit.configurations import READINGS_PER_CELL
+from ohmskin.circuit.skin import Skin, readings
 from ohmskin.emulate.faults import SkinFaults
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.link.protocol import ADC_BITS, MODES

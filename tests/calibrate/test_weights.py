@@ -17,7 +17,7 @@ from ohmskin.arrays import Float
 from ohmskin.calibrate.guide import Press, State, Step
 from ohmskin.calibrate.sessions import joined
 from ohmskin.calibrate.tables import load_press_table
-from ohmskin.circuit.skin import current_from_ratio
+from ohmskin.circuit.configurations import current_from_ratio
 from ohmskin.cli.weights import ANYWHERE, KeptAnywhere, KeptPresses, guided
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan

@@ -12,7 +12,8 @@ from network import SkinCircuit
 from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.tables import PRESS
 from ohmskin.calibrate.wires import FoundWires, PressReadings, find_wires
-from ohmskin.circuit.skin import Skin, current_from_ratio
+from ohmskin.circuit.configurations import current_from_ratio
+from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import load_calibration
 from pressed_skin import LAWS, Plan, PressedSkin, calibrate

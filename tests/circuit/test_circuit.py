@@ -6,15 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ohmskin.circuit.skin import (
-    Skin,
-    all_readings,
-    current_from_ratio,
-    current_std,
-    end_admittance,
-    port_resistance_ohm,
-    readings,
-)
+from ohmskin.circuit.configurations import current_from_ratio, current_std
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance, port_resistance_ohm, readings
 from places import DATA
 from skins import uniform_skin
 from studies.trials import reference_trial

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from network import Network, SkinCircuit, laplacian_readings, skin_network
-from ohmskin.circuit.skin import PortCircuit, Skin, all_readings, end_admittance, readings
+from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance, readings
 from places import DATA
 
 CROSSBARS = json.loads((DATA / "qucs_crossbars.json").read_text())

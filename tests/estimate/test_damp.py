@@ -6,7 +6,8 @@ import pytest
 
 from network import SkinCircuit, leaks  # tests/helpers
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit, Skin
+from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.joint import JointEstimator, TouchEstimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from network import laplacian_readings
-from ohmskin.circuit.skin import Skin, ratio_from_current, readings
+from ohmskin.circuit.configurations import ratio_from_current
+from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import solve_ports, voltage_squared
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator

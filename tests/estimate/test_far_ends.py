@@ -8,7 +8,8 @@ import pytest
 
 from network import laplacian_readings  # tests/helpers
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit, Skin, all_readings, end_admittance
+from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator

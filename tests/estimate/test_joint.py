@@ -9,12 +9,8 @@ import scipy.linalg
 
 from network import SkinCircuit  # tests/helpers
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import (
-    PortCircuit,
-    Skin,
-    port_resistance_ohm,
-    readings,
-)
+from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.estimate import full_fit
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit

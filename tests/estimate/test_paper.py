@@ -6,7 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from ohmskin.circuit.skin import Skin, current_from_ratio, ratio_from_current, readings
+from ohmskin.circuit.configurations import current_from_ratio, ratio_from_current
+from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate import paper
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.matrix import MatrixEstimator

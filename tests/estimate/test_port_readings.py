@@ -9,13 +9,7 @@ import pytest
 
 from network import SkinCircuit
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import (
-    Skin,
-    all_readings,
-    end_admittance,
-    port_resistance_ohm,
-    readings,
-)
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance, port_resistance_ohm, readings
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_faults import ALIKE_FRAMES, DOUBT_FRAMES
 from ohmskin.estimate.port_readings import PortReader

@@ -10,7 +10,8 @@ import scipy.stats
 
 from network import Network, skin_network  # tests/helpers
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit, Skin, port_resistance_ohm
+from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.skin import Skin, port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator

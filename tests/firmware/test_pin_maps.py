@@ -13,7 +13,7 @@ import pytest
 import ohmskin
 from firmware_helpers import assert_whole, numbers
 from lockstep import BOARDS, DEFAULT_SCAN, LockstepSim, Rig, elf_of
-from ohmskin.circuit.skin import ratio_from_current
+from ohmskin.circuit.configurations import ratio_from_current
 from ohmskin.emulate import simavr
 from ohmskin.emulate.scenes import LEAD_OHM
 from ohmskin.emulate.simavr import SimulationError

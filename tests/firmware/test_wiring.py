@@ -12,7 +12,7 @@ import pytest
 
 from firmware_helpers import assert_whole
 from lockstep import BOARDS, LockstepSim, Rig, elf_of
-from ohmskin.circuit.skin import ratio_from_current
+from ohmskin.circuit.configurations import ratio_from_current
 from ohmskin.link.codes import quantise
 from pin_maps import of_platformio_ini, told_by
 from second_simulator import SecondSim

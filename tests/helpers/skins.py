@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READINGS_PER_CELL, Skin
+from ohmskin.circuit.configurations import READINGS_PER_CELL
+from ohmskin.circuit.skin import Skin
 from ohmskin.emulate.faults import joined_readings
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.link.codes import quantise, ratio_from_codes

@@ -39,7 +39,7 @@ from ohmskin.calibrate.presses import Calibrator, Progress, number_presses
 from ohmskin.calibrate.tables import ForceLog, gaps
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.calibrate.wires import FoundWires, wire_prior
-from ohmskin.circuit.skin import PortCircuit
+from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.small import one_blas_thread, solve_positive
 from ohmskin.estimate.base import TOUCH_SIEMENS, Estimator
 from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, WireOhm

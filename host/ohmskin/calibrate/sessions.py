@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import node_ratio
+from ohmskin.circuit.configurations import node_ratio
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.record.recording import ForceSample, Recording, Tare
 

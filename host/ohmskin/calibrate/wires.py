@@ -54,7 +54,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import PortCircuit, wire_coupling_ohm
+from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.skin import wire_coupling_ohm
 from ohmskin.circuit.small import one_blas_thread, solve_positive
 from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, SkinKnowledge, WireOhm
 from ohmskin.estimate.port_readings import PortReader

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From resistances to readings.
 
-`skin` is the network of resistors, `small` solves its matrices, and `plate` is a board of known
+`skin` is the network of resistors, `ports` has what each port shows and its slopes, `small` solves
+their matrices, and `configurations` has what is read of a current. `plate` is a board of known
 resistors in place of a skin.
 
 May import: `ohmskin.link` and what is below it.

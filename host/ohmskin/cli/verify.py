@@ -10,8 +10,8 @@ import numpy as np
 from typer import Argument, Option
 
 import ohmskin
+from ohmskin.circuit.configurations import CONFIGURATIONS
 from ohmskin.circuit.plate import load_plate
-from ohmskin.circuit.skin import CONFIGURATIONS
 from ohmskin.cli.board import Leads, Port, Wires, wires_of
 from ohmskin.cli.doctor import as_object, print_page, terminal
 from ohmskin.cli.doctor_words import line_in_words

@@ -33,7 +33,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import READING_SENSES_TOP, READING_SIGN
+from ohmskin.circuit.configurations import READING_SENSES_TOP, READING_SIGN
 from ohmskin.doctor import limits
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.signal import Rest

@@ -58,7 +58,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit import skin as circuit
+from ohmskin.circuit.configurations import as_near, current_from_ratio, ratio_from_current
+from ohmskin.circuit.ports import PortCircuit, port_difference
+from ohmskin.circuit.skin import Skin, end_admittance, impedance_of
 from ohmskin.doctor.circuit import LinesAndCells
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, LineWire, Place, lines_of
 from ohmskin.doctor.limits import (
@@ -112,9 +114,9 @@ class FarSkin:
         before = before.reshape(ratio.shape[1], -1, 4).swapaxes(0, 1)[np.ix_(*kept)]
         ratio = ratio[np.ix_(*kept)]
         self.shape = ratio.shape[0], ratio.shape[1]
-        near = circuit.as_near(ratio, "aebf")
+        near = as_near(ratio, "aebf")
         # At least 1e-9 S, which no code shows: losses are divided by it.
-        self._current = np.maximum(circuit.current_from_ratio(near, *self._refs), 1e-9)
+        self._current = np.maximum(current_from_ratio(near, *self._refs), 1e-9)
         a, e, b, f = np.moveaxis(ratio, -1, 0)
         loss = np.stack([a - e, f - b])
         # A loss is the difference of two readings, and the A r that explains it is not exact.
@@ -147,14 +149,14 @@ class FarSkin:
         leads_ohm: both leads of a port.
         """
         refs_ohm = sum(self._refs)
-        of_wires = circuit.PortCircuit(self.cell_siemens, *wire_ohm).port_ohm
-        of_wires -= circuit.PortCircuit(self.cell_siemens, 0.0, 0.0).port_ohm
+        of_wires = PortCircuit(self.cell_siemens, *wire_ohm).port_ohm
+        of_wires -= PortCircuit(self.cell_siemens, 0.0, 0.0).port_ohm
         # At least 1 ohm: in a short, noise may make less than nothing of what is left.
         of_wires += leads_ohm
         port_ohm = np.maximum(1 / self._current - refs_ohm - of_wires.reshape(self.shape), 1.0)
-        ratio = circuit.ratio_from_current(1 / (port_ohm + refs_ohm), *self._refs)
+        ratio = ratio_from_current(1 / (port_ohm + refs_ohm), *self._refs)
         self.cell_siemens = self._matrix.estimate(ratio).cell_siemens
-        wired = circuit.PortCircuit(self.cell_siemens, *wire_ohm)
+        wired = PortCircuit(self.cell_siemens, *wire_ohm)
         return wired.line_current(0), wired.line_current(1)
 
     def ends(self, wire_ohm: Float) -> tuple[Float, Float]:
@@ -165,11 +167,11 @@ class FarSkin:
         are (R, R, C) of rows, and (C, C, R) of columns.
         """
         rows, lines = self.shape[0], sum(self.shape)
-        admittance = circuit.end_admittance(circuit.Skin(self.cell_siemens, *wire_ohm))
-        by_line = circuit.impedance_of(admittance, rows)[0][:lines]
+        admittance = end_admittance(Skin(self.cell_siemens, *wire_ohm))
+        by_line = impedance_of(admittance, rows)[0][:lines]
         # Potential of each end while a current of 1 goes through each port (R, C). All near ends
         # come first, rows and then columns, and then all far ends.
-        ends = circuit.port_difference(by_line, rows).T.reshape(-1, *self.shape)
+        ends = port_difference(by_line, rows).T.reshape(-1, *self.shape)
         row, column = np.indices(self.shape)
         at_row, at_column = ends[row, row, column], ends[rows + column, row, column]
         of_columns = ends[lines + rows :] - at_column

@@ -33,7 +33,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit import skin as circuit
+from ohmskin.circuit.configurations import (
+    CONFIGURATIONS,
+    READING_OFFSET,
+    READING_SENSES_TOP,
+    READING_SIGN,
+    reference_ohm,
+)
+from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import DEAD_SHARE, NOISY_LSB, PRESSED_LSB
@@ -127,15 +134,15 @@ class PlateExam:
         knowledge = SkinKnowledge.of(
             scans.board, nominal_wire_ohm=self.wire_ohm._replace(lead=0.0), ref_log_std=0.0
         )
-        shown = circuit.READING_SIGN * (scans.mean + 0.5 - FULL_LSB * circuit.READING_OFFSET)
+        shown = READING_SIGN * (scans.mean + 0.5 - FULL_LSB * READING_OFFSET)
         # 1 / I less the leads, with I = s / 1024 R.
-        per_ohm = circuit.reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm) * FULL_LSB
+        per_ohm = reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm) * FULL_LSB
         shown /= 1 - 2 * (self.wire_ohm.lead or 0.0) * shown / per_ohm
         self.shown_lsb = self._in_order(shown, knowledge, diagnosis)
         knowledge = self._with_references(knowledge, diagnosis)
         as_is = self._examine_cells(_estimate(self.shown_lsb, knowledge), diagnosis)
-        ratio = circuit.readings(self._skin(as_is, knowledge))
-        self.predicted_lsb = FULL_LSB * circuit.READING_SIGN * (ratio - circuit.READING_OFFSET)
+        ratio = readings(self._skin(as_is, knowledge))
+        self.predicted_lsb = FULL_LSB * READING_SIGN * (ratio - READING_OFFSET)
         self._examine_lines(diagnosis)
 
     def _examine_signal(self, evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
@@ -175,10 +182,10 @@ class PlateExam:
         estimate = _estimate(self.shown_lsb, board)
         bad = np.logical_or(*self._open_and_bridged(estimate))
         siemens = np.where(bad, estimate.cell_siemens, self.plate)
-        port_ohm = circuit.port_resistance_ohm(self._skin(siemens, board))
+        port_ohm = port_resistance_ohm(self._skin(siemens, board))
         share = self.shown_lsb / FULL_LSB
-        top = share[..., circuit.READING_SENSES_TOP].mean(axis=2)
-        bottom = share[..., ~circuit.READING_SENSES_TOP].mean(axis=2)
+        top = share[..., READING_SENSES_TOP].mean(axis=2)
+        bottom = share[..., ~READING_SENSES_TOP].mean(axis=2)
         of_plate = 1 - top - bottom
         tells = (self.plate > 0) & ~bad & (of_plate > LOOP_SHARES[0]) & (of_plate < LOOP_SHARES[1])
         if not tells.any():
@@ -193,10 +200,10 @@ class PlateExam:
             diagnosis.add(Kind.REFERENCE_VALUE, most_percent=most, **values)
         return replace(board, ref_top_ohm=ohm[0], ref_bottom_ohm=ohm[1])
 
-    def _skin(self, siemens: Float, board: SkinKnowledge) -> circuit.Skin:
+    def _skin(self, siemens: Float, board: SkinKnowledge) -> Skin:
         """The plate with these cells, at this board."""
         top, bottom = (np.full(siemens.shape, ohm) for ohm in self.wire_ohm.both or (0.0, 0.0))
-        return circuit.Skin(siemens, top, bottom, board.ref_top_ohm, board.ref_bottom_ohm)
+        return Skin(siemens, top, bottom, board.ref_top_ohm, board.ref_bottom_ohm)
 
     def _open_and_bridged(self, estimate: Estimate) -> tuple[Bool, Bool]:
         """Cells whose resistor does not conduct, and cells that conduct without a resistor."""
@@ -241,7 +248,7 @@ class PlateExam:
     def _examine_lines(self, diagnosis: Diagnosis) -> None:
         """Add configurations whose readings are no straight line over what the circuit predicts."""
         most = self.tolerance
-        for k, name in enumerate(circuit.CONFIGURATIONS):
+        for k, name in enumerate(CONFIGURATIONS):
             lit = self.predicted_lsb[..., k] > most.offset_lsb  # an offset may clip others
             x, y = self.predicted_lsb[lit, k], self.shown_lsb[lit, k]
             if x.size and np.ptp(x) > LEAST_SPAN_LSB:
@@ -261,7 +268,7 @@ class PlateExam:
 
 def _estimate(shown_lsb: Float, knowledge: SkinKnowledge) -> Estimate:
     """What `joint` estimates from s."""
-    ratio = np.clip(circuit.READING_OFFSET + circuit.READING_SIGN * shown_lsb / FULL_LSB, 0.0, 1.0)
+    ratio = np.clip(READING_OFFSET + READING_SIGN * shown_lsb / FULL_LSB, 0.0, 1.0)
     return make_estimator("joint", knowledge).estimate(ratio)
 
 

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import READING_SIGN, READINGS_PER_CELL
+from ohmskin.circuit.configurations import READING_SIGN, READINGS_PER_CELL
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB, SWITCH_LEAD_STD_OHM
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB

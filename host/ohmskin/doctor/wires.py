@@ -55,7 +55,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import PortCircuit, current_std
+from ohmskin.circuit.configurations import current_std
+from ohmskin.circuit.ports import PortCircuit
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
 from ohmskin.doctor.limits import (
     CHANGED_SHARE,

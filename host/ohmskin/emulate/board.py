@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import DEFAULT_REF_OHM
+from ohmskin.circuit.configurations import DEFAULT_REF_OHM
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.link import framing, protocol
 from ohmskin.link.clock import BITS_PER_BYTE

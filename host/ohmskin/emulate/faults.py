@@ -23,14 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import (
-    DEFAULT_REF_OHM,
-    Skin,
-    all_readings,
-    end_admittance,
-    leak_admittance,
-    readings,
-)
+from ohmskin.circuit.configurations import DEFAULT_REF_OHM
+from ohmskin.circuit.skin import Skin, all_readings, end_admittance, leak_admittance, readings
 from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES, PER_PASS, from_scan_order, in_scan_order
 
 # An open wire, and a cell without contact, have this resistance [ohm]. It is not infinite, so that

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ohmskin.arrays import FULL_SCALE_USIEMENS, Bool, Float, heat_map
-from ohmskin.circuit.skin import NEAR, is_near, ratio_from_current
+from ohmskin.circuit.configurations import NEAR, is_near, ratio_from_current
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.port_readings import PortReader, PortReadings

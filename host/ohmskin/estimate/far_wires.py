@@ -66,7 +66,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit
+from ohmskin.circuit.ports import PortCircuit
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (

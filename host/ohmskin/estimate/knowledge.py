@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import (
+from ohmskin.circuit.configurations import (
     DEFAULT_REF_OHM,
     MAX_OHM,
     NEAR,

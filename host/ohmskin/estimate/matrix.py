@@ -43,7 +43,8 @@ import numpy as np
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import impedance_of, port_difference
+from ohmskin.circuit.ports import port_difference
+from ohmskin.circuit.skin import impedance_of
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinKnowledge
 from ohmskin.estimate.ohm import conductance_from_current, port_current

@@ -16,7 +16,7 @@ voltage over the reference resistors. In all else it is `ohm`.
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN
+from ohmskin.circuit.configurations import READING_OFFSET, READING_SIGN
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings

@@ -46,15 +46,14 @@ import casadi
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import (
+from ohmskin.circuit.configurations import (
     READING_OFFSET,
     READING_SENSES_TOP,
     READINGS_PER_CELL,
-    Skin,
-    port_difference,
     ratio_from_current,
-    readings,
 )
+from ohmskin.circuit.ports import port_difference
+from ohmskin.circuit.skin import Skin, readings
 from ohmskin.ctrl_c import ctrl_c_kept
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, SkinKnowledge

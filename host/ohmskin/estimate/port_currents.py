@@ -57,7 +57,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import (
+from ohmskin.circuit.configurations import (
     EXCHANGED,
     NEAR,
     READING_OFFSET,

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import PortCircuit
+from ohmskin.circuit.ports import PortCircuit
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import FarReadings, NearEnds, NearReadings, PortCurrents
 from ohmskin.estimate.port_noise import Spread

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import READING_OFFSET, READING_SIGN, reference_ohm
+from ohmskin.circuit.configurations import READING_OFFSET, READING_SIGN, reference_ohm
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import PortCurrents
 from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE

@@ -52,7 +52,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit, leak_slopes, port_difference, wire_current
+from ohmskin.circuit.ports import PortCircuit, leak_slopes, port_difference, wire_current
 from ohmskin.circuit.small import cholesky, gram, inverse, solve, solve_lower, solve_positive
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings

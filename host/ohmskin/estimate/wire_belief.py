@@ -87,7 +87,7 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import PortCircuit
+from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.small import solve, solve_lower
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings

@@ -49,7 +49,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import READINGS_PER_CELL, is_near
+from ohmskin.circuit.configurations import READINGS_PER_CELL, is_near
 from ohmskin.estimate.knowledge import (
     NO_WIRES,
     WIRE_FIELDS,

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ohmskin.arrays import FULL_SCALE_N, Bool, Float, heat_map
-from ohmskin.circuit.skin import is_near
+from ohmskin.circuit.configurations import is_near
 from ohmskin.errors import TareRefused
 from ohmskin.estimate.base import Estimate, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, REF_LOG_STD, SkinKnowledge

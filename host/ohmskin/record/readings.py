@@ -46,7 +46,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import DEFAULT_REF_OHM, NEAR
+from ohmskin.circuit.configurations import DEFAULT_REF_OHM, NEAR
 from ohmskin.estimate.knowledge import WIRE_FIELDS, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.files import PathName, naming, require_file, whole_file

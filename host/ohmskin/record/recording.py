@@ -49,7 +49,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import is_near
+from ohmskin.circuit.configurations import is_near
 from ohmskin.errors import RecordingError
 from ohmskin.files import PathName, require_file, stored_bytes
 from ohmskin.link import layouts

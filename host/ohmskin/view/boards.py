@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
-from ohmskin.circuit.skin import as_near
+from ohmskin.circuit.configurations import as_near
 from ohmskin.emulate.urls import is_stepped
 from ohmskin.errors import OhmskinError
 from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES, Estimate

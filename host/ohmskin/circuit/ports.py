@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the ports of a skin show, and their slopes by every resistance.
+
+Symbols are those of `ohmskin.circuit.skin`.
+"""
+
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ohmskin.arrays import Float
+from ohmskin.circuit.skin import (
+    Wire,
+    admittance_of,
+    factorised,
+    impedance_of,
+    leak_admittance,
+    path_of_lines,
+)
+from ohmskin.circuit.small import solve_lower
+
+# Ones on and below the diagonal, (n, n): which cells k of a line are behind segment j, k >= j.
+_triangle = lru_cache(maxsize=8)(np.tri)
+
+
+def port_difference(lines: Float, rows: int) -> Float:
+    """For each port, the values of its row less those of its column: (RC, n), from (R+C, n)."""
+    return (lines[:rows, None] - lines[None, rows:]).reshape(-1, lines.shape[1])
+
+
+def wire_current(cell_current: Float) -> Float:
+    """Currents through all wires, (n, 2, R, C), from those through the cells (n, R, C).
+
+    A wire segment carries the sum of the currents of all cells behind it. These sums are computed
+    as products with a triangle of ones, which is faster than adding up.
+    """
+    _, rows, columns = cell_current.shape
+    current = np.empty((len(cell_current), 2, rows, columns))
+    by_row = cell_current.reshape(-1, columns) @ _triangle(columns)
+    current[:, 0] = by_row.reshape(cell_current.shape)
+    np.matmul(_triangle(rows).T, cell_current, out=current[:, 1])
+    return current
+
+
+class PortCircuit:
+    """What the ports of a skin show, and its slopes by all resistances. All cells conduct (g > 0).
+
+    Ports (RC,) are in row-major order. A port is driven at its near ends. It is sensed there, or at
+    far ends, where no current flows out.
+
+    shape, rows: (R, C), and R.
+    wire_ohm: segments of the top and of the bottom layer, as they were given.
+    far: whether rows, and whether columns, are sensed at their far ends.
+    leak_siemens: between neighbouring rows, and columns, at each crossing [S] (`leak_admittance`).
+    impedance: potentials of electrodes per current into each electrode, (R+C, R+C) [ohm].
+    sensed: potentials of electrodes per current into each sensed end, (R+C, R+C) [ohm].
+    factor: L of `factorised` (RC, RC).
+    port_ohm: voltage between the sensed ends per current through the port (RC,) [ohm]. At near ends
+        this is rho; at far ends it is rho less what the wires up to them lose.
+    drop_ohm: voltage that the wire of the row, and that of the column, lose up to the sensed end,
+        per current of the port (2, RC) [ohm]; 0 for lines that are sensed at near ends. Only a
+        circuit that senses far ends has this attribute.
+
+    **Slopes.** d port_ohm / d log r_e = r_e i_e j_e [ohm], by Tellegen's theorem. i_e is the
+    current through resistance e while a current of one flows through the driven ends of the port,
+    and j_e is the same if it flowed through the sensed ends. So the currents that give port_ohm
+    also give all its RC x 3RC slopes. A port's currents are those of its row less those of its
+    column: so R+C solutions are enough.
+
+    **Far ends.** A current into the far end of a line flows through all of the line's wire. Each
+    cell of the line shares a part of this wire, so a voltage is added in the path to this cell: F
+    per current. By reciprocity, the sensed ends have the potentials (Z (1 - Q))^T per current into
+    the near ends.
+    """
+
+    def __init__(
+        self,
+        cell_siemens: Float,
+        top_wire_ohm: Wire,
+        bottom_wire_ohm: Wire,
+        *,
+        far: tuple[bool, bool] = (False, False),
+        leak_siemens: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Cells (R, C) [S], all > 0; wire segments [ohm]; far, leak_siemens: as the attributes."""
+        self.shape, self.rows = cell_siemens.shape, len(cell_siemens)
+        self.wire_ohm, self.far = (top_wire_ohm, bottom_wire_ohm), far
+        self._root, to_sense = np.sqrt(cell_siemens), None
+        if any(far):
+            sign = np.repeat([1.0 * far[0], -1.0 * far[1]], self.shape)
+            to_sense = sign * path_of_lines(top_wire_ohm, bottom_wire_ohm, self.shape)
+        self.factor, self._half = factorised(self._root, *self.wire_ohm, to_sense)
+        near = self._half[:, : sum(self.shape)]
+        admittance, self.leak_siemens = admittance_of(near), leak_siemens
+        if any(leak_siemens):
+            admittance += leak_admittance(self.shape, leak_siemens)
+        self.impedance, port_ohm = impedance_of(admittance, self.rows)
+        self.sensed = self.impedance
+        if to_sense is not None:
+            lost = self.impedance @ (near.T @ self._half[:, sum(self.shape) :])
+            self.sensed = self.impedance - lost
+            drop = _ends_of_ports(lost, self.rows)
+            self.drop_ohm: Float = np.stack([drop[0], -drop[1]]).reshape(2, -1)
+            port_ohm = port_ohm - self.drop_ohm.sum(axis=0).reshape(self.shape)
+        self.port_ohm: Float = port_ohm.ravel()
+
+    @cached_property
+    def _currents(self) -> Float:
+        """Currents through all cells per potential of each electrode, (RC, R+C).
+
+        If far ends are sensed, R+C columns follow: the currents that F drives.
+        """
+        currents = solve_lower(self.factor, self._half, transposed=True)
+        currents *= self._root.reshape(-1, 1)
+        return currents
+
+    @property
+    def per_potential(self) -> Float:
+        """Currents through all cells per potential of each electrode, (RC, R+C) [S]."""
+        return self._currents[:, : sum(self.shape)]
+
+    @cached_property
+    def cell_current(self) -> Float:
+        """Currents through all cells per current into each electrode, (R+C, R, C)."""
+        return (self.impedance @ self.per_potential.T).reshape(-1, *self.shape)
+
+    @cached_property
+    def sense_current(self) -> Float:
+        """Currents through all cells per current into each sensed end, (R+C, R, C)."""
+        if not any(self.far):
+            return self.cell_current
+        driven = self._currents[:, sum(self.shape) :].T
+        return (self.sensed.T @ self.per_potential.T + driven).reshape(-1, *self.shape)
+
+    @cached_property
+    def _wire_current(self) -> Float:
+        """Currents through all wires, (R+C, 2, R, C), per current into each electrode."""
+        return wire_current(self.cell_current)
+
+    @cached_property
+    def _wire_sense_current(self) -> Float:
+        """Currents through all wires per current into each sensed end, (R+C, 2, R, C).
+
+        A current into a far end flows back to the near end, through the whole line.
+        """
+        if not any(self.far):
+            return self._wire_current
+        current = wire_current(self.sense_current)
+        if self.far[0]:
+            np.einsum("iij->ij", current[: self.rows, 0])[:] -= 1.0
+        if self.far[1]:
+            np.einsum("jij->ij", current[self.rows :, 1])[:] += 1.0
+        return current
+
+    def line_current(self, layer: int) -> Float:
+        """Currents through the segments of a line, per current through each port of this line.
+
+        (lines, ports of the line, segments); layer 0: lines are rows; layer 1: columns.
+        """
+        rows, current = self.rows, self._wire_current[:, layer]
+        if layer == 0:
+            by_row = np.einsum("iik->ik", current[:rows])[:, None]
+            return np.asarray(by_row - current[rows:].transpose(1, 0, 2))
+        by_column = np.einsum("jkj->jk", current[rows:])[:, None]
+        return np.asarray(current[:rows].transpose(2, 0, 1) - by_column)
+
+    def _slopes(self, current: Float, sensed: Float, ohm: Float) -> Float:
+        """r_e i_e j_e of all ports, (RC, resistances), from currents of lines (R+C, ...)."""
+        slopes = port_difference(current.reshape(len(current), -1), self.rows)
+        if sensed is current:
+            slopes *= slopes
+        else:
+            slopes *= port_difference(sensed.reshape(len(sensed), -1), self.rows)
+        slopes *= ohm.ravel()
+        return slopes
+
+    def shorted_port_ohm(self, first: NDArray[np.intp], short_ohm: float) -> Float:
+        """`port_ohm` if two near ends were joined, for each of k shorts by itself, (RC, k) [ohm].
+
+        first: the first electrode of each short, of R+C; the other is the next one, (k,).
+        short_ohm: what joins them, above 0.
+
+        A current of one through a port makes the voltage x between both near ends. Joined, they
+        carry x / (z + short_ohm), where z is their own port resistance (Thevenin). By reciprocity,
+        this lowers the voltage at the sensed ends by xs of it: x for a current that flows through
+        the sensed ends.
+        """
+        x, sensed = (
+            port_difference((each[first] - each[first + 1]).T, self.rows)
+            for each in (self.impedance, self.sensed)
+        )
+        apart = self.impedance[first] - self.impedance[first + 1]
+        z = apart[np.arange(len(first)), first] - apart[np.arange(len(first)), first + 1]
+        return np.asarray(self.port_ohm[:, None] - x * sensed / (z + short_ohm))
+
+    def by_cell(self) -> Float:
+        """Slopes by the log resistance of each cell, (RC, RC) [ohm]."""
+        return self._slopes(self.cell_current, self.sense_current, self._root**-2.0)
+
+    def by_wires(self) -> Float:
+        """Slopes by the log of each wire segment, (RC, 2RC) [ohm]: top segments come first."""
+        ohm = np.empty((2, *self.shape))
+        ohm[0], ohm[1] = self.wire_ohm
+        return self._slopes(self._wire_current, self._wire_sense_current, ohm)
+
+    def by_layers(self) -> Float:
+        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm].
+
+        They are the sums of `by_wires` over each layer. Here a product of the currents of lines
+        gives them without the slopes by single segments, which takes less time.
+        """
+        slopes, lines = [], len(self.impedance)
+        for layer, ohm in enumerate(self.wire_ohm):
+            current = self._wire_current[:, layer].reshape(lines, -1)
+            sensed = self._wire_sense_current[:, layer].reshape(lines, -1)
+            row, column = _ends_of_ports((current * np.ravel(ohm)) @ sensed.T, self.rows)
+            slopes.append((row - column).ravel())
+        return np.transpose(slopes)
+
+    def by_leaks(self) -> Float:
+        """Slopes by the leaks of rows, and of columns, (RC, 2) [ohm / S]."""
+        volt, sensed = (
+            port_difference(potential.T, self.rows) for potential in (self.impedance, self.sensed)
+        )
+        return leak_slopes(volt, sensed, self.shape)
+
+
+def leak_slopes(volt: Float, sensed: Float, shape: tuple[int, int]) -> Float:
+    """d port_ohm / d leak of rows, and of columns, at each crossing, (n, 2) [ohm / S].
+
+    For a single conductance, d port_ohm / d g = -v v', v and v' the voltages over it. A leak is one
+    conductance between each two neighbouring lines at each crossing, so the products are summed.
+
+    volt, sensed: potentials of electrodes (n, R+C), per current through the driven ends, and
+        through the sensed ends, of n ports [ohm].
+    """
+    rows, columns = shape
+    return np.stack(
+        [
+            -crossings * np.einsum("pl,pl->p", np.diff(volt[:, lines]), np.diff(sensed[:, lines]))
+            for lines, crossings in ((slice(rows), columns), (slice(rows, None), rows))
+        ],
+        axis=1,
+    )
+
+
+def _ends_of_ports(lines: Float, rows: int) -> Float:
+    """What the current of each port causes at its row and at its column, (2, R, C).
+
+    lines[i, j] (R+C, R+C): what a current into line j causes at line i; or transposed. The current
+        of a port flows into its row and out of its column.
+    """
+    at_itself, by_row, by_column = lines.diagonal(), lines[:rows, rows:], lines[rows:, :rows]
+    return np.stack([at_itself[:rows, None] - by_column.T, by_row - at_itself[rows:]])
