@@ -158,7 +158,7 @@ def test_a_clock_that_jumps_takes_no_memory() -> None:
     assert np.isfinite(shown).all()
     none = np.zeros_like(time_s)
     rise = rises(force_n, np.ones(force_n.shape[1]))
-    found = TotalFit(Totals(time_s, rise, press, none, time_s, force_n.sum(axis=1)))
+    found = TotalFit(Totals((3, 4), time_s, rise, press, none, time_s, force_n.sum(axis=1)))
     assert found.presses == 40
 
 
@@ -167,10 +167,10 @@ def test_presses_during_which_the_scale_was_silent_do_not_count() -> None:
     none, rise = np.zeros_like(time_s), rises(force_n, np.ones(force_n.shape[1]))
     shown = time_s < 12.0
     of_skin, of_scale = (time_s, rise, press, none), (time_s[shown], force_n.sum(axis=1)[shown])
-    assert TotalFit(Totals(*of_skin, *of_scale)).presses == 20
+    assert TotalFit(Totals((3, 4), *of_skin, *of_scale)).presses == 20
     few = (of_scale[0][:100], of_scale[1][:100])
     with pytest.raises(ValueError, match="fewer than 5 presses of the skin while it was weighed"):
-        TotalFit(Totals(*of_skin, *few))
+        TotalFit(Totals((3, 4), *of_skin, *few))
 
 
 def test_what_is_left_out_ends_at_a_gap_and_pauses_are_no_presses() -> None:
@@ -183,7 +183,9 @@ def test_what_is_left_out_ends_at_a_gap_and_pauses_are_no_presses() -> None:
     shown_n = force_n.sum(axis=1) + 5.0 * ((time_s > 139.5) & (time_s < 141.5))
     shown_n += 0.01 * np.random.default_rng(4).standard_normal(time_s.size)
     rise = rises(force_n, np.ones(force_n.shape[1]))
-    found = TotalFit(Totals(time_s, rise, press, np.zeros_like(time_s), time_s, shown_n)).fit()
+    found = TotalFit(
+        Totals((3, 4), time_s, rise, press, np.zeros_like(time_s), time_s, shown_n)
+    ).fit()
     assert found.left_out == [pytest.approx((139.0, 142.0), abs=0.1)]
     assert (found.presses, found.presses_left_out) == (60, 0)
 
@@ -201,13 +203,13 @@ def fit() -> tuple[TotalFit, Float, list[int]]:
     shown_n = Scale(0.1, 0.1).shown(time_s, total_n[:, None], at_s)[:, 0] + 0.8
     shown_n += 0.02 * random.standard_normal(at_s.size)
     none = np.zeros_like(time_s)
-    totals = Totals(time_s, rises(force_n, gains), press, none, at_s, shown_n)
+    totals = Totals((3, 4), time_s, rises(force_n, gains), press, none, at_s, shown_n)
     return TotalFit(totals).fit(), gains, beside
 
 
 def test_curves_are_found_from_sums(fit: tuple[TotalFit, Float, list[int]]) -> None:
     found, gains, _ = fit
-    model = found.model((3, 4))
+    model = found.model()
     for force_n in (1.0, 3.0):
         rise = rises(np.full(12, force_n), gains).reshape(3, 4)
         read_n = model.predict(rise, np.zeros_like(rise))[0]
@@ -219,7 +221,7 @@ def test_a_cell_that_nobody_pressed_says_so(fit: tuple[TotalFit, Float, list[int
     stds = found.gain_std()
     assert stds[:-1].max() < 0.5 * stds[-1]
     assert stds[-1] == pytest.approx(np.std(np.log(gains)), rel=0.3)
-    model = found.model((3, 4))
+    model = found.model()
     assert model.pooled.ravel().tolist() == [False] * 11 + [True]
     rise = rises(np.full(12, 2.0), gains).reshape(3, 4)
     force_n, std_n = model.predict(rise, np.zeros_like(rise))
@@ -329,7 +331,7 @@ def test_hysteresis_and_unseen_force_are_not_taken_for_wires() -> None:
     rise *= np.where(np.diff(force_n, axis=0, prepend=0.0) > -1e-9, 0.96, 1.04)
     margin = 4.0 * (hold > 0)  # cells around each press, which has 0.06 N on each of them
     shown_n = force_n.sum(axis=1) + 0.06 * margin + 0.01 * random.standard_normal(time_s.size)
-    totals = Totals(time_s, rise, press, margin, time_s, shown_n)
+    totals = Totals((3, 4), time_s, rise, press, margin, time_s, shown_n)
     # The further a cell is, and the harder it is pressed, the less it shows with such wires.
     far = np.array([[0, 1, 2, 3] * 3, [0] * 4 + [1] * 4 + [2] * 4])
     slopes = 0.05 * far[:, None, :] * rise / 1e-4

@@ -214,7 +214,7 @@ class Kneading:
         rise = levels.rise[used]
         of_scans = time_s[used], rise, self._press[used], self._margin(rise)
         if self._weighed is not None:
-            return Totals(*of_scans, time_s[used], log.at(time_s[used]), lags=False)
+            return Totals(self.shape, *of_scans, time_s[used], log.at(time_s[used]), lags=False)
         inside = (log.time_s >= time_s[0]) & (log.time_s <= time_s[-1])
         at_s = log.time_s[inside]
         if at_s.size > time_s.size:
@@ -224,7 +224,7 @@ class Kneading:
         known = np.isfinite(shown_n) & used[scan] & ~self._unseen(at_s)
         if not known.any():
             raise ValueError("skin and scale were not read at the same time")
-        return Totals(*of_scans, at_s[known], shown_n[known])
+        return Totals(self.shape, *of_scans, at_s[known], shown_n[known])
 
     def _unseen(self, at_s: Float) -> Bool:
         """Whether what the scale shows then, (m,) [s], may be of a gap of the scans."""

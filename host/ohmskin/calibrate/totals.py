@@ -36,6 +36,10 @@ with these priors: gains scatter by `GAIN_STD` about the curve of all cells, whi
 by the scatter that it sees; b is near `EXPONENT`; the zero changes by about `ZERO_STEP_N` from knot
 to knot; w is what was told of the wires.
 
+A fingertip covers some ten cells, so sums tell little of how gains of neighbours differ. That the
+forces under a fingertip are smooth tells more of it (`smoothness`): g and e follow that, too. Not
+while wires are looked for, which came out no better with it.
+
 All rows of one press have nearly the same error. So they count as `PRESS_ROWS` rows together, and a
 press is kept or left out as a whole. In the first rounds, only the presses that fit best count, and
 the gains of cells may hardly differ. After these, all presses count but those that are off by more
@@ -67,6 +71,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.rules import MIN_PRESSES
 from ohmskin.calibrate.scale import EARLIEST_S, Scale, fit_scale
+from ohmskin.calibrate.smoothness import Smoothness, peaks, smoothness
 from ohmskin.calibrate.tables import gaps
 from ohmskin.force.curve import MAX_EXPONENT, MIN_EXPONENT, POWER, ForceModel
 
@@ -146,6 +151,7 @@ _MEDIAN_STD: Final = 0.6745
 class Totals(NamedTuple):
     """What a skin and the scale under it have shown.
 
+    shape: (R, C) of the skin.
     time_s: time of each scan, (n,) [s].
     rise: x, (n, C).
     press: number of the press that each scan is of, (n,); below 0: it is of none.
@@ -156,6 +162,7 @@ class Totals(NamedTuple):
         number is the force at its time.
     """
 
+    shape: tuple[int, int]
     time_s: Float
     rise: Float
     press: NDArray[np.intp]
@@ -311,13 +318,26 @@ class TotalFit:
         precision, pull = self._prior()
         weighted = jacobian * weight[:, None]
         precision = precision + weighted.T @ jacobian
-        step = np.linalg.solve(precision, weighted.T @ self.off_n_ + pull)
+        pull += weighted.T @ self.off_n_
+        if self._wires is None and (smooth := self._smoothness()):
+            of_both = slice(self._of_gains.start, self._of_bends.stop)
+            precision[of_both, of_both] += smooth.precision
+            pull[of_both] += smooth.pull
+        step = np.linalg.solve(precision, pull)
         farthest = np.abs(step[: self._of_zero.start]).max()
         p = self._p = self._p + step * min(1.0, 1.0 / farthest)
         p[1:4] = p[1:4].clip(*LIMITS)
         self.covariance_ = np.linalg.inv(precision)
         if self._totals.lags:
             self._take_scale(replace(self.scale_, delay_s=max(float(p[-1]), EARLIEST_S)))
+
+    def _smoothness(self) -> Smoothness | None:
+        """What the presses that are kept tell of gains and exponents by being smooth."""
+        log_contact = self._contact()[0]
+        forces = self._parts(log_contact)
+        kept = np.where(self._out[self._of_scan], -1, self._totals.press)
+        scans = peaks(forces, kept)
+        return smoothness(forces[scans], log_contact[scans], self._totals.shape)
 
     def _jacobian(self) -> Float:
         """How what the scale shows follows p, (m, p); sets `total_n_`, what it is to show."""
@@ -430,9 +450,9 @@ class TotalFit:
         """Standard deviation of the log of each cell's gain, (C,)."""
         return np.asarray(np.sqrt(self.covariance_.diagonal()[self._of_gains]))
 
-    def model(self, shape: tuple[int, int]) -> ForceModel:
+    def model(self) -> ForceModel:
         """The curves of all cells: power laws as near to those of the fit as there are."""
-        p, cells = self._p, np.arange(self._on.shape[1])
+        p, shape, cells = self._p, self._totals.shape, np.arange(self._on.shape[1])
         level, steeper = self._straight()
         by_exponent = level - steeper * np.log(self._unit)
         # log(slope) = k + g + (b + e) by_exponent, exponent = (b + e) steeper

@@ -337,7 +337,7 @@ def _knead(
         log = replace(log, time_s=log.time_s + offset_s + late_s, any_zero=True)
     fit = kneading.learn(log, progress("scans"), lags=lags)
     lag_s = fit.scale_.lag_s - late_s
-    calibration = calibrator.calibration_of(fit.model(kneading.shape), fit.largest_n)
+    calibration = calibrator.calibration_of(fit.model(), fit.largest_n)
     calibration.save(out)
     first_s, stds = kneading.time_s[0], fit.gain_std()
     left_out = [[begin - first_s, end - first_s] for begin, end in fit.left_out]
