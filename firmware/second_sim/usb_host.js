@@ -37,6 +37,7 @@ class UsbHost {
         this.clock = mcu.clock;
         this.busFreeNs = 0;
         this.armed = new Map(); // buffer controls that are the controller's: offset -> value
+        this.carrying = new Set(); // buffer controls whose packet is on its way
         this.toggles = new Map(); // what the next packet of an offset has to be: 0 or DATA1
         this.control = null; // the control transfer at hand
         this.endpoints = { in: -1, out: -1 };
@@ -160,7 +161,7 @@ class UsbHost {
 
     // Whether there is a packet to carry for a buffer that is armed.
     wants(offset) {
-        if (this.carrying?.has(offset)) return false;
+        if (this.carrying.has(offset)) return false;
         if (offset === BUFFER_CONTROLS) return this.control !== null && this.control.stage === "data" && this.ready(offset);
         if (offset === BUFFER_CONTROLS + 4)
             return this.control !== null && (this.control.stage === "status" || this.control.data !== null);
@@ -178,14 +179,12 @@ class UsbHost {
         const value = this.armed.get(offset);
         const toBoard = isOut ? this.takeOut(offset, value & LENGTH) : null;
         const count = isOut ? toBoard.length : value & LENGTH;
-        this.carrying ??= new Set();
         this.carrying.add(offset);
         const begin = Math.max(this.clock.nanos, this.busFreeNs);
         this.busFreeNs = begin + (PACKET_OVERHEAD + count) * BYTE_NS;
-        const { mcu } = this;
         this.after(this.busFreeNs - this.clock.nanos, () => {
             this.carrying.delete(offset);
-            if (mcu === this.mcu && this.armed.get(offset) === value) this.carried(offset, value, toBoard);
+            if (this.armed.get(offset) === value) this.carried(offset, value, toBoard);
             this.serve();
         });
     }

@@ -214,6 +214,13 @@ def address_of(symbol: str) -> int:
     return {line.split()[-1]: int(line.split()[0], 16) for line in listing.splitlines()}[symbol]
 
 
+def test_the_simulated_host_finds_a_board_that_was_reset_amid_packets(rig: Rig) -> None:
+    for n in range(6):
+        rig.start_scan(rows=16, columns=16, rate_mhz=0, settle_us=1)
+        rig.run(0.01 + 13e-6 * n)  # a packet takes 51 us, and most of the time one is on its way
+        assert reset(rig)["reset_cause"] == ("external",)
+
+
 @pytest.mark.parametrize("scanning", [False, True])
 def test_watchdog_restarts_a_hung_main_loop(rig: Rig, scanning: bool) -> None:
     if scanning:
