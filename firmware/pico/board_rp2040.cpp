@@ -221,13 +221,21 @@ constexpr uint32_t ALARM0 = 1;
 constexpr uint32_t SLEEP_US = 100;
 // All but the two oscillators: the watchdog resets these.
 constexpr uint32_t PSM_ALL = 0x1FFFC;
+// What this firmware leaves in SCRATCH4, which the watchdog's reset keeps. Chosen: none of the
+// ROM's words, 0 and B007C0D3h.
+constexpr uint32_t RAN = 0x6F686D73;
 uint8_t reset_cause_bits;
 
-// The chip's records survive the watchdog's reset, so the watchdog's is asked first.
+// The chip's records survive the watchdog's reset, so the watchdog's is asked first. The ROM's boot
+// loader restarts the chip by it, too, when it has taken a file or been told to: then SCRATCH4 is
+// its own, and nothing has hung.
 uint8_t read_reset_cause() {
     constexpr uint32_t BY_TIMER = 1, HAD_POWER_ON = 1u << 8, HAD_RUN_PIN = 1u << 16;
-    if (at(WATCHDOG_REASON) & BY_TIMER)
-        return static_cast<uint8_t>(frames::ResetCause::Watchdog);
+    const uint32_t reason = at(WATCHDOG_REASON);
+    if (reason != 0)
+        return reason & BY_TIMER && at(WATCHDOG_SCRATCH4) == RAN
+                   ? static_cast<uint8_t>(frames::ResetCause::Watchdog)
+                   : uint8_t{0};
     const uint32_t had = at(CHIP_RESET);
     if (had & HAD_RUN_PIN)
         return static_cast<uint8_t>(frames::ResetCause::External);
@@ -242,6 +250,7 @@ void begin() {
             BLOCK_TIMER | BLOCK_USBCTRL);
     at(PSM_WDSEL) = PSM_ALL;
     at(WATCHDOG_LOAD) = WATCHDOG_US * WATCHDOG_COUNTS_PER_US;
+    at(WATCHDOG_SCRATCH4) = RAN;
     at(WATCHDOG_CTRL) = 1u << 30;
     at(PWM_DIV) = SLOT_CLOCK_DIVIDER << 4;
     pins_begin();

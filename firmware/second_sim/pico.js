@@ -48,8 +48,9 @@ class Pico {
         this.start(POWER_ON, 0);
     }
 
-    // chipReset: what the register CHIP_RESET says; reason: the watchdog's register REASON.
-    start(chipReset, reason) {
+    // chipReset: what the register CHIP_RESET says; reason, scratch: the watchdog's registers REASON
+    // and SCRATCH0 to SCRATCH7.
+    start(chipReset, reason, scratch = []) {
         const before = this.mcu;
         const mcu = new RP2040();
         this.mcu = mcu;
@@ -70,9 +71,10 @@ class Pico {
         mcu.peripherals[0x40064].readUint32 = (offset) => (offset === CHIP_RESET ? chipReset : 0);
         const watchdog = mcu.peripherals[0x40058];
         watchdog.reason = reason;
+        watchdog.scratchData.set(scratch);
         watchdog.onWatchdogTrigger = () => {
             watchdog.timer.enable = false; // else it triggers for ever
-            this.nextReset = () => this.start(this.chipReset, 1);
+            this.nextReset = () => this.start(this.chipReset, 1, watchdog.scratchData);
         };
         // Nothing may run from the flash once it is no memory any more: it reads as breakpoints.
         this.flash.attach(mcu, () => mcu.flash.fill(0xbe, 0, FLASH_BYTES));
@@ -124,6 +126,12 @@ class Pico {
     cutPower() {
         this.flash.cut();
         this.start(POWER_ON, 0);
+    }
+
+    // The ROM has taken a UF2 file: it says so in SCRATCH4, and has the watchdog restart the chip.
+    restartByRom() {
+        const { scratchData } = this.mcu.peripherals[0x40058];
+        this.start(this.chipReset, 1, scratchData.map((word, n) => (n === 4 ? 0 : word)));
     }
 
     jump(address) {

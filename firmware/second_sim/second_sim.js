@@ -61,6 +61,7 @@ const OPERATIONS = {
     X: (board) => board.reset(),
     J: (board, content) => board.jump(content.readUInt32LE()),
     P: (board) => board.cutPower(),
+    F: (board) => board.restartByRom(),
     U: (board, content) => board.line.setOpen(content[0] !== 0),
     H: (board, content) => board.line.clearHalt(content[0]),
     V: (board) => Buffer.from(JSON.stringify(board.line.said())),

@@ -214,6 +214,17 @@ def address_of(symbol: str) -> int:
     return {line.split()[-1]: int(line.split()[0], 16) for line in listing.splitlines()}[symbol]
 
 
+def test_new_firmware_says_of_no_watchdog_that_it_hung(rig: Rig) -> None:
+    """The ROM's boot loader has the watchdog restart the chip once the file is there."""
+    assert isinstance(rig.sim, PicoSim)
+    for _ in range(2):
+        before = len(rig.frames("hello"))
+        rig.sim.restart_by_rom()
+        rig.run(rig.sim.boot_s)
+        (hello,) = rig.frames("hello")[before:]
+        assert hello["reset_cause"] == ()
+
+
 def test_the_simulated_host_finds_a_board_that_was_reset_amid_packets(rig: Rig) -> None:
     for n in range(6):
         rig.start_scan(rows=16, columns=16, rate_mhz=0, settle_us=1)

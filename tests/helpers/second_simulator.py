@@ -49,6 +49,10 @@ class PicoSim(LockstepSim):
         """Switch it off and on again: what the flash was writing is left half done."""
         self.request("P")
 
+    def restart_by_rom(self) -> None:
+        """Restart it as its ROM does when a UF2 file has been copied to it: by the watchdog."""
+        self.request("F")
+
     def open_port(self, is_open: bool) -> None:
         """Let a program of the host open the port, or close it."""
         self.request("U", struct.pack("<?", is_open))
