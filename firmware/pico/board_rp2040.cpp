@@ -273,13 +273,14 @@ uint32_t now_us() { return at(TIMERAWL); }
 
 // Sleeps until the next interrupt where there is nothing to do, but not for long: the flash has no
 // interrupt. Interrupts are off meanwhile: one that comes just before the instruction that sleeps
-// ends it at once.
+// ends it at once. USB's is asked for only then: what has come since poll() looked makes it at
+// once, and if it were taken before the sleep, nothing would end that.
 void mark_pass(bool worked) {
     if (worked)
         return;
-    usb_serial::wake_at_news();
     at(TIMER_ALARM0) = now_us() + SLEEP_US;
     asm volatile("cpsid i" ::: "memory");
+    usb_serial::wake_at_news();
     if (!scanner.has_group())
         asm volatile("wfi");
     asm volatile("cpsie i" ::: "memory");

@@ -214,6 +214,22 @@ def address_of(symbol: str) -> int:
     return {line.split()[-1]: int(line.split()[0], 16) for line in listing.splitlines()}[symbol]
 
 
+def test_a_board_that_goes_to_sleep_misses_no_command(rig: Rig, rng: np.random.Generator) -> None:
+    """One that comes amid the pass before the sleep is answered as soon as any other."""
+    rig.run(0.01)
+    step_cycles = 160  # 10 us
+    waits = set()
+    for _ in range(200):
+        rig.sim.run_cycles(int(rng.integers(16_000, 40_000)))
+        rig.send("get_hello")
+        steps = 1
+        while not rig.sim.run_cycles(step_cycles):
+            steps += 1
+            assert steps < 100
+        waits.add(steps)
+    assert max(waits) - min(waits) <= 1
+
+
 def test_new_firmware_says_of_no_watchdog_that_it_hung(rig: Rig) -> None:
     """The ROM's boot loader has the watchdog restart the chip once the file is there."""
     assert isinstance(rig.sim, PicoSim)
