@@ -4,9 +4,12 @@
 /* The core: loading, running, resets, and the register hooks of the peripherals modelled here. */
 #include "skinsim.h"
 
+#include <fcntl.h>
+#include <gelf.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include <simavr/avr_extint.h>
 #include <simavr/avr_timer.h>
@@ -328,13 +331,25 @@ static bool load_boot_loader(const char *path, uint32_t program_end) {
     return fits("program below the boot loader", 0, program_end, start);
 }
 
+/* simavr's own reader takes any long file: it finds no program in it, and runs an empty flash. */
+static bool is_avr_elf(const char *path) {
+    const int file = open(path, O_RDONLY);
+    elf_version(EV_CURRENT);
+    Elf *elf = elf_begin(file, ELF_C_READ, NULL);
+    GElf_Ehdr header;
+    const bool is = gelf_getehdr(elf, &header) && header.e_machine == EM_AVR;
+    elf_end(elf);
+    close(file);
+    return is;
+}
+
 bool cpu_start(const struct board *board, const char *elf_path, const char *loader_path) {
     const char *mcu = board->mcu;
     static elf_firmware_t firmware;
     static avr_io_t resets = {.kind = "skinsim", .reset = on_reset};
 
     avr_global_logger_set(log_errors);
-    if (elf_read_firmware(elf_path, &firmware) || !firmware.flash) {
+    if (!is_avr_elf(elf_path) || elf_read_firmware(elf_path, &firmware) || !firmware.flash) {
         fprintf(stderr, "skinsim: cannot load '%s' as an AVR ELF file\n", elf_path);
         return false;
     }

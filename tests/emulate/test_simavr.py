@@ -101,9 +101,11 @@ def test_program_errors(build: Build, tmp_path: Path, monkeypatch: pytest.Monkey
         LockstepSim("uno", tmp_path / "none.elf")
     with pytest.raises(SimulationError, match="usage"):
         LockstepSim("due", elf)
-    (tmp_path / "not.elf").write_bytes(b"no ELF")
-    with pytest.raises(SimulationError, match="cannot load"):
-        LockstepSim("uno", tmp_path / "not.elf")
+    (tmp_path / "short.elf").write_bytes(b"no ELF")
+    (tmp_path / "long.hex").write_bytes(b":100000000C9434000C945C000C945C000C945C00B4\n" * 99)
+    for no_program in (tmp_path / "short.elf", tmp_path / "long.hex", PROGRAM):
+        with pytest.raises(SimulationError, match=r"cannot load '.*' as an AVR ELF file"):
+            LockstepSim("uno", no_program)
     for pins, wrong in BAD_PINS.items():
         with pytest.raises(SimulationError, match=wrong):
             LockstepSim("uno", elf, pins=pins)
