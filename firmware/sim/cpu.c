@@ -4,6 +4,7 @@
 /* The core: loading, running, resets, and the register hooks of the peripherals modelled here. */
 #include "skinsim.h"
 
+#include <errno.h>
 #include <fcntl.h>
 #include <gelf.h>
 #include <stdio.h>
@@ -299,11 +300,17 @@ static int hex_record(const char *line, uint8_t bytes[300]) {
 static bool load_boot_loader(const char *path, uint32_t program_end) {
     enum { DATA = 0, SEGMENT = 2, LINEAR = 4, ADDRESS = 1, TYPE = 3, CONTENT = 4 };
     FILE *file = fopen(path, "r");
+    if (!file) {
+        fprintf(stderr,
+                "skinsim: cannot read '%s': %s (Debian's arduino-core-avr has the boards')\n", path,
+                strerror(errno));
+        return false;
+    }
     uint32_t base = 0, start = UINT32_MAX;
-    bool good = file != NULL;
+    bool good = true;
     char line[700];
     while (good && fgets(line, sizeof line, file)) {
-        uint8_t record[300];
+        uint8_t record[300] = {0};
         good = hex_record(line, record) > 0;
         if (!good)
             break;
@@ -321,8 +328,7 @@ static bool load_boot_loader(const char *path, uint32_t program_end) {
             }
         }
     }
-    if (file)
-        fclose(file);
+    fclose(file);
     if (!good || start == UINT32_MAX) {
         fprintf(stderr, "skinsim: '%s' is no Intel hex file for this chip\n", path);
         return false;

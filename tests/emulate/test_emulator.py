@@ -500,7 +500,11 @@ def test_no_frame_upsets_the_emulator(sent: list[tuple[int, bytes]]) -> None:
 @pytest.mark.simavr
 @pytest.mark.parametrize(
     ("option", "reason"),
-    [("elf=/etc/passwd", "^no setting 'elf'"), ("bootloader=/dev/null", "is no Intel hex file")],
+    [
+        ("elf=/etc/passwd", "^no setting 'elf'"),
+        ("bootloader=/dev/null", "is no Intel hex file"),
+        ("bootloader=/none.hex", "cannot read '/none.hex': No such file"),
+    ],
 )
 def test_the_simulator_takes_no_file_for_firmware(option: str, reason: str) -> None:
     with pytest.raises(PortError, match=reason) as refused:
