@@ -14,7 +14,6 @@ const ROSC_HZ = 6.5e6; // at which the chip starts (data sheet, 2.17)
 const CHIP_RESET = 8, POWER_ON = 1 << 8, RUN_PIN = 1 << 16;
 const CONVERSION_NS = 2000; // 96 clocks of 48 MHz (4.9.2)
 const GPIO_SIO = 5;
-const ADC_CHANNEL_SHIFT = 12;
 const NEVER_COUNTS = 0xffffffff;
 const A_TO_H = 8, EQUAL_DRIVE = 8, UNDRIVEN = 9, OTHER_CHANNEL = 10;
 const TOP_HIGH = "abef", BOTTOM_HIGH = "dchg";

@@ -22,7 +22,7 @@
 #include <simavr/sim_interrupts.h>
 
 enum { ADC_L = 0x78, ADC_H = 0x79, ADCSRA_ = 0x7A, ADCSRB_ = 0x7B, ADMUX_ = 0x7C };
-enum { ADEN_ = 0x80, ADSC_ = 0x40, ADATE_ = 0x20, ADIF_ = 0x10, ADIE_ = 0x08, ADPS_ = 0x07 };
+enum { ADEN_ = 0x80, ADSC_ = 0x40, ADATE_ = 0x20, ADIF_ = 0x10, ADPS_ = 0x07 };
 enum { ADLAR_ = 0x20, REFS_ = 0xC0, REFS_AVCC = 0x40, MUX_ = 0x1F, MUX5_ = 0x08, ADTS_ = 0x07 };
 
 enum phase { IDLE, WAITING, SAMPLING, HOLDING, TRACKING };
