@@ -76,6 +76,8 @@ const char *settings_set(char *text) {
     static char error[600];
     if (!strcmp(text, "desk=1") || !strcmp(text, "desk=0"))
         return set_desk(text[5] == '1');
+    if (!strncmp(text, "desk=", 5))
+        return "desk must be 0 or 1";
     char *separator = strchr(text, '='), *end;
     if (!separator)
         return "O: write name=number";

@@ -70,6 +70,22 @@ def test_bad_requests_are_refused(simulate: Simulate) -> None:
     assert sim.stats()["state"] == "running"
 
 
+@pytest.mark.parametrize(
+    ("setting", "wrong"),
+    [
+        (b"desk=2", "^desk must be 0 or 1$"),
+        (b"desk=", "^desk must be 0 or 1$"),
+        (b"tau_us=x", "^tau_us must be from 0 to 1e"),
+        (b"tau=1", "^no setting 'tau': there are desk, tau_us,"),
+    ],
+)
+def test_a_setting_that_is_refused_is_told_why(
+    simulate: Simulate, setting: bytes, wrong: str
+) -> None:
+    with pytest.raises(SimulationError, match=wrong):
+        simulate(FOREVER).request("O", setting)
+
+
 def test_a_request_that_is_refused_takes_the_replies_of_those_after_it(simulate: Simulate) -> None:
     sim = simulate(FOREVER)
     with pytest.raises(SimulationError, match="tau"):
