@@ -43,8 +43,9 @@ struct Endpoint {
         armed = true;
         at(buffer_control()) = control;
         // The controller's clock is slower: AVAILABLE comes when the rest has arrived (4.1.2.5.1).
+        // The compiler, too, has to have put the packet's bytes into the buffer by then.
         for (uint8_t i = 0; i < 4; i++)
-            asm volatile("nop\n nop\n nop");
+            asm volatile("nop\n nop\n nop" ::: "memory");
         at(buffer_control()) = control | AVAILABLE;
     }
     // The next packet is DATA0, be it the one that the controller has already.
