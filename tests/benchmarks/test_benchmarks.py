@@ -10,9 +10,11 @@ import runpy
 import sys
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from bars import at_least, report
+from bench_firmware import capacitor_error_lsb
 from places import ROOT
 
 BENCHMARKS = sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py"))
@@ -59,3 +61,17 @@ def test_a_bar_of_what_nobody_measures_is_an_error() -> None:
     """A figure that was renamed would else have no bar, and nobody would know."""
     with pytest.raises(KeyError, match="speed"):
         report({"spede": 5.0}, [at_least("speed", 1)])
+
+
+@pytest.mark.simavr
+@pytest.mark.parametrize("node_pf", [100, 200])
+def test_an_error_of_less_than_a_code_is_measured(node_pf: int) -> None:
+    """It was read as 0 LSB: a reading far from the next code shows nothing of it.
+
+    By arithmetic: the charge that 14 pF bring is shared with the node, and goes through 30 kOhm. It
+    has 353 cycles: a slot of 689, less the 10.5 ADC clocks until the simulator's capacitor joins.
+    """
+    joined_pf = 14 + node_pf
+    shared_lsb = 1024 * 14 / joined_pf * np.exp(-353 / 16e6 / (30e3 * 1e-12 * joined_pf))
+    found_lsb = capacitor_error_lsb("uno", 0, sample_pf=14, node_pf=node_pf)
+    assert found_lsb == pytest.approx(shared_lsb, abs=0.05)
