@@ -46,16 +46,19 @@ def report(figures: Figures, bars: Iterable[Bar]) -> bool:
 
     Raises KeyError for a bar of a figure that nobody measures: it would always be met.
     """
-    by_figure = {bar.figure: bar for bar in bars}
+    by_figure: dict[str, list[Bar]] = {}
+    for bar in bars:
+        by_figure.setdefault(bar.figure, []).append(bar)
     if by_figure.keys() - figures.keys():
         raise KeyError(f"no figure {', '.join(sorted(by_figure.keys() - figures.keys()))}")
     all_met = True
     print(f"{'figure':38}{'measured':>12}  {'bar':14}")
     for name, value in figures.items():
-        bar = by_figure.get(name)
-        met = bar is None or (value is not None and bar.met(value))
+        own = by_figure.get(name, [])
+        met = all(value is not None and bar.met(value) for bar in own)
         all_met = all_met and met
-        wanted, verdict = ("", "") if bar is None else (bar.wanted, "pass" if met else "FAIL")
+        wanted = ", ".join(dict.fromkeys(bar.wanted for bar in own))
+        verdict = ("pass" if met else "FAIL") if own else ""
         print(f"{name:38}{'-' if value is None else value:>12}  {wanted:14}{verdict}".rstrip())
     return all_met
 

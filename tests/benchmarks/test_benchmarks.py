@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bars import at_least, report
+from bars import at_least, at_most, report
 from bench_firmware import capacitor_error_lsb
 from places import ROOT
 
@@ -61,6 +61,15 @@ def test_a_bar_of_what_nobody_measures_is_an_error() -> None:
     """A figure that was renamed would else have no bar, and nobody would know."""
     with pytest.raises(KeyError, match="speed"):
         report({"spede": 5.0}, [at_least("speed", 1)])
+
+
+def test_a_figure_is_held_to_all_of_its_bars(capsys: pytest.CaptureFixture[str]) -> None:
+    """The last one was the only one: the others passed whatever the figure was."""
+    bars = [at_least("speed", 1), at_most("speed", 3), at_most("speed", 3)]
+    assert report({"speed": 2.0}, bars)
+    assert not report({"speed": 4.0}, bars)
+    assert not report({"speed": 0.5}, bars)
+    assert ">= 1, <= 3 " in capsys.readouterr().out
 
 
 @pytest.mark.simavr
