@@ -271,11 +271,12 @@ class Pooled(dict[str, float | None]):
     def bar(
         self, make: Callable[[str, float], Bar], prefix: str, figure: str, limit: float
     ) -> None:
-        """The same bar for this figure of all whose name begins so."""
-        ends = f"_{figure}"
-        for key in self:
-            if key.startswith(f"{prefix}_") and key.endswith(ends):
-                self.bars.append(make(key, limit))
+        """The same bar for this figure of all whose name begins so; KeyError: of none."""
+        begins, ends = f"{prefix}_", f"_{figure}"
+        keys = [key for key in self if key.startswith(begins) and key.endswith(ends)]
+        if not keys:
+            raise KeyError(f"no figure {begins}...{ends}")
+        self.bars += [make(key, limit) for key in keys]
 
 
 def skins_of(part: Part, seed: int, kinds: Sequence[str] = KINDS, **more: Any) -> list[Scene]:

@@ -15,6 +15,7 @@ import pytest
 
 from bars import at_least, at_most, report
 from bench_firmware import capacitor_error_lsb
+from bench_honest import Pooled
 from places import ROOT
 
 BENCHMARKS = sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py"))
@@ -61,6 +62,15 @@ def test_a_bar_of_what_nobody_measures_is_an_error() -> None:
     """A figure that was renamed would else have no bar, and nobody would know."""
     with pytest.raises(KeyError, match="speed"):
         report({"spede": 5.0}, [at_least("speed", 1)])
+
+
+def test_a_bar_of_all_figures_of_a_name_needs_one() -> None:
+    found = Pooled([], 1, lambda done, of: None)
+    found["line_start_random_joint_named"] = 100.0
+    found.bar(at_least, "line_start", "named", 100)
+    assert [bar.figure for bar in found.bars] == list(found)
+    with pytest.raises(KeyError, match="lines_start"):
+        found.bar(at_least, "lines_start", "named", 100)
 
 
 def test_a_figure_is_held_to_all_of_its_bars(capsys: pytest.CaptureFixture[str]) -> None:
