@@ -37,7 +37,7 @@ class UsbHost {
         this.clock = mcu.clock;
         this.busFreeNs = 0;
         this.armed = new Map(); // buffer controls that are the controller's: offset -> value
-        this.carrying = new Set(); // buffer controls whose packet is on its way
+        this.carrying = new Set(); // offsets of packets on the bus: those of before have been lost
         this.toggles = new Map(); // what the next packet of an offset has to be: 0 or DATA1
         this.control = null; // the control transfer at hand
         this.endpoints = { in: -1, out: -1 };
@@ -182,9 +182,10 @@ class UsbHost {
         this.carrying.add(offset);
         const begin = Math.max(this.clock.nanos, this.busFreeNs);
         this.busFreeNs = begin + (PACKET_OVERHEAD + count) * BYTE_NS;
+        const { mcu } = this;
         this.after(this.busFreeNs - this.clock.nanos, () => {
             this.carrying.delete(offset);
-            if (this.armed.get(offset) === value) this.carried(offset, value, toBoard);
+            if (mcu === this.mcu && this.armed.get(offset) === value) this.carried(offset, value, toBoard);
             this.serve();
         });
     }

@@ -209,6 +209,14 @@ def test_power_cut_during_save_leaves_the_old_settings_or_the_new(
     assert seen == {False, True}
 
 
+def test_a_power_cut_amid_a_packet_leaves_a_board_that_answers(rig: Rig) -> None:
+    """The simulated host waited for the packet's end for ever, and sent the board nothing more."""
+    rig.send("save")
+    rig.run(11e-6)
+    cut_power(rig)
+    rig.must("get_hello")
+
+
 def address_of(symbol: str) -> int:
     listing = subprocess.check_output(["arm-none-eabi-nm", PICO_ELF], text=True)
     return {line.split()[-1]: int(line.split()[0], 16) for line in listing.splitlines()}[symbol]
