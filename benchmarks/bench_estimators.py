@@ -10,8 +10,8 @@ What is measured how:
 
 unit_ms                 what one look at an 8x8 circuit must cost, one core, median: a Cholesky
                         factorisation, a solution for 16 columns and a product of symmetric
-                        matrices of order 64. It is measured before every frame.
-units_*                 median time of a frame's estimate over that of the unit just before it; of
+                        matrices of order 64. It is measured after every frame.
+units_*                 median time of a frame's estimate over that of the unit just after it; of
                         the 16x16 and 32x32 skins the unit has their order and columns. `presses`:
                         one second of four overlapping presses. `random`: every frame touched anew,
                         so that a warm start is worth little. `finger`: soft fingertips that move,
@@ -32,8 +32,9 @@ stretched_*, doubled_*  8x8, 40 random frames, then all wires half as much again
 finger_*                8x8, a fingertip with soft edges that covers some 15 cells, around the skin
                         in 4 s at 90 Hz, wires told: median error of a cell above 1 uS over rest,
                         share of all cells within 4 stated standard deviations.
-within_*                `joint`, all scenes above, and the sweeps: share of all errors within 1, 2
-                        and 4 stated standard deviations.
+within_*                `joint`, cells of the scenes `error` and `bent`, of ngspice's files and of
+                        the paper's sweeps: share of all errors within 1, 2 and 4 stated standard
+                        deviations. Not of wires that change at once: `stretched`, `doubled`.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def unit_s(cells: int) -> Callable[[], float]:
 
 
 def times_of(method: str, sources: list[Readings]) -> tuple[Float, Float]:
-    """Seconds of each frame, and of the unit just before it."""
+    """Seconds of each frame, and of the unit just after it."""
     taken: list[tuple[float, float]] = []
     for readings in sources:
         measure = unit_s(readings.ratio[0, ..., 0].size)

@@ -17,7 +17,8 @@ told_*_worst    the worst total where the wires are told: the nominal 100 and 20
 mixed_*         the same fingertips on skins with wires of 20 ohm to 1 kohm a segment, not told:
                 90th percentile of the total's error, pressed cells within 4 stated deviations.
 limit_*         90th percentile of the errors that one frame of them allows whoever knows which
-                cells are pressed: wires not told, and wires known exactly (studies/information.py).
+                cells are pressed: wires not told, and the mean wire of each layer known exactly,
+                but not how segments deviate from it (studies/information.py).
 """
 
 from __future__ import annotations

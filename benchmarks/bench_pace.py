@@ -17,8 +17,8 @@ desk_*              the same scenes on the desk of `make bench-desk`: the built 
                     largest ghost of a frame, 95th percentile, the worst of them; *_hz: scans a
                     second between the near scans.
 partial_*           a region of 3x3 cells around one fingertip, b alone, after one whole frame in
-                    thirty: time of its estimate over that of whole frames, and in units of `make
-                    bench-estimators`.
+                    thirty: time of its estimate by `joint` over that of whole frames, and in units
+                    of `make bench-estimators`.
 focus_*, new_touch_*, refocus_*, slip_*, clock_*
                     the host and the built firmware together: focused.py says what they are.
 joint_16x16_*       time of `joint` under a fingertip on 16x16 cells, wires not told, in units of

@@ -74,7 +74,10 @@ def press_series(seed: int) -> ForceTrial:
 def cross_talk(
     seeds: int, slow_seeds: int, progress: Progress | None = None
 ) -> tuple[ForceTrial, list[CrossTalk]]:
-    """The first skin's series, and what all of them show; the paper's methods on fewer skins."""
+    """The first skin's series, and what all of them show.
+
+    The paper's methods read fewer skins, every tenth frame of the series, and one of each press.
+    """
     steps = Steps(seeds * len(FAST) + slow_seeds * len(SLOW), progress)
     percents: dict[tuple[str, str], list[float]] = {}
     trials = [press_series(seed) for seed in range(seeds)]
