@@ -243,6 +243,17 @@ def skin() -> KneadedSkin:
     return KneadedSkin(Plan((100.0, 200.0), "series", 1, shape=(4, 4), touches=40), scans=2500)
 
 
+def test_each_skin_has_a_scale_that_drifts_otherwise() -> None:
+    """All had the same noise and drift: a median of five skins was that of one scale."""
+    off_n = []
+    for seed in (1, 2):
+        skin = KneadedSkin(Plan((100.0, 200.0), "series", seed, (2, 2), touches=1), scans=500)
+        drifts, ideal = ScaleBelow(10.0, noise_n=0.0, drift_n=0.2), ScaleBelow(10.0, noise_n=0.0)
+        off_n.append(skin.total(drifts, beside=False)[1] - skin.total(ideal, beside=False)[1])
+    assert np.abs(off_n[0]).max() > 0.05
+    assert np.abs(off_n[0] - off_n[1]).max() > 0.01
+
+
 def changed(path: Path, *, scans: list[Scan] | None = None, forces: list[ForceSample]) -> None:
     """Put other scans, or other forces, into a recording."""
     given = load_recording(path)

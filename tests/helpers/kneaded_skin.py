@@ -74,6 +74,7 @@ class KneadedSkin(PressedSkin):
         weights: int = 0,
     ) -> None:
         self._span_s, self._beside, self._weights = scans / SCAN_HZ, beside, weights
+        self._seed = plan.seed
         if weights:
             self._span_s = weights * (WEIGHT_S[-1] + 0.5 * PAUSE_S) + 4.0
         self.presses: list[Press] = []
@@ -147,7 +148,8 @@ class KneadedSkin(PressedSkin):
                 slow = keep * slow + (1 - keep) * now_n
                 force_n[n] = slow
         shown_s = time_s if scale.rate_hz is None else np.arange(0.0, time_s[-1], 1 / scale.rate_hz)
-        random = np.random.default_rng(3)
+        # The same for all scales under one skin, and another for each skin.
+        random = np.random.default_rng([self._seed, 78])
         shown_n = np.interp(shown_s - scale.delay_s, fine_s, force_n)
         shown_n += scale.noise_n * random.standard_normal(shown_s.size)
         phase = random.uniform(0, 2 * np.pi)
