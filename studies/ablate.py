@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each number in `joint` and `touch` earns: each is halved, doubled and put off, in turn.
 
-A constant is a public number that `prior`, `full_fit`, `sparse_fit` or `joint` annotates as Final.
+A constant is a public number that one of `MODULES` annotates as Final.
 Every variant reads the same frames (`ablate_scenes`) as the estimators as they are. Every figure is
 an error or a share of bad answers, so a ratio above 1 is a loss:
 
@@ -42,12 +42,12 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
-from ohmskin.estimate import full_fit, joint, prior, sparse_fit
+from ohmskin.estimate import full_fit, joint, prior, sparse_fit, staying_faults, wire_belief
 from studies.ablate_scenes import SCENES, Plan, Sample, observe
 from studies.conditions import Case
 from studies.rows import Progress, as_csv, field_names, in_processes
 
-MODULES: Final = (prior, full_fit, sparse_fit, joint)
+MODULES: Final = (prior, full_fit, sparse_fit, joint, wire_belief, staying_faults)
 # What makes a constant do nothing, or, of a deviation, what is all but certain: 0 would divide.
 OFF: Final[dict[str, float]] = {
     "prior.UNTOUCHED_STD": 10.0,

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make ablate`: which constants there are, that each is put back, what the figures say."""
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -12,6 +15,7 @@ from ohmskin.estimate import (
     port_noise,
     prior,
     sparse_fit,
+    staying_faults,
     wire_belief,
 )
 from studies import ablate
@@ -20,7 +24,10 @@ from studies.ablate_scenes import Plan
 
 TINY = Plan(skins=3, frames=4)
 SCENE = "ngspice_random"
-MODULES = (far_wires, full_fit, joint, port_faults, port_noise, prior, sparse_fit, wire_belief)
+MODULES = (
+    *(far_wires, full_fit, joint, port_faults, port_noise, prior, sparse_fit),
+    *(staying_faults, wire_belief),
+)
 BY_LABEL = {constant.label: constant for constant in ablate.constants()}
 TRIED = [BY_LABEL["prior.SEGMENT_STD"], BY_LABEL["sparse_fit.RIVAL_SHARE"]]
 
@@ -32,6 +39,33 @@ def test_every_number_is_tried() -> None:
     assert BY_LABEL["prior.MAX_ITERATIONS"].variants == {"halved": 20, "doubled": 80}
     assert not {"full_fit.LEFT_OUT_STDS", "sparse_fit._HIGHEST_LOG_SIEMENS"} & set(BY_LABEL)
     assert set(OFF) <= set(BY_LABEL)
+
+
+def test_numbers_that_moved_out_of_joint_are_tried_still() -> None:
+    assert {"staying_faults.STAYING_SURPRISE", "wire_belief.LARGE_MOVE_LOG"} <= set(BY_LABEL)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(Path(joint.__file__).parent.glob("*.py")), ids=lambda path: path.stem
+)
+def test_no_default_keeps_a_constant_as_it_is(path: Path) -> None:
+    """`REST_FITS` was one: it was changed, and the function went on with 3 fits."""
+    kept: list[ast.expr | None] = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.Lambda):
+            kept += [*node.args.defaults, *node.args.kw_defaults]
+        elif isinstance(node, ast.ClassDef):
+            kept += [field.value for field in node.body if isinstance(field, ast.AnnAssign)]
+    names = {
+        name.id
+        for value in kept
+        if value is not None
+        for name in ast.walk(value)
+        if isinstance(name, ast.Name)
+    }
+    # A constant of its own; and a default that no method takes.
+    names -= {"paper": {"MAX_ITERATIONS"}, "prior": {"REACH_STDS"}}.get(path.stem, set())
+    assert not names & {constant.name for constant in BY_LABEL.values()}
 
 
 @pytest.mark.parametrize("constant", BY_LABEL.values(), ids=lambda constant: constant.label)

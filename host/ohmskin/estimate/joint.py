@@ -437,7 +437,7 @@ class JointEstimator(Estimator):
         if before is None:
             level = rest_level(ports.current, self.knowledge.ref_ohm)
             log_cells: Float = np.full(ports.current.size, -np.log(level))
-            fit = self._fit_rest(ports, log_cells)
+            fit = self._fit_rest(ports, log_cells, REST_FITS)
         else:
             fit = self._fit_rest(ports, before.expected, 1)
         if not (self._belief.has_leaks or fit.message):
@@ -468,7 +468,7 @@ class JointEstimator(Estimator):
             # would go back and forth.
             leaks_us = np.clip(leaks_us + 0.5 * more_us, 0.0, MOST_LEAK_US)
             self._belief.expect_leaks(leaks_us, np.full(2, SEARCHED_LEAK_STD_US))
-            fit = self._fit_rest(ports, fit.log_cells)
+            fit = self._fit_rest(ports, fit.log_cells, REST_FITS)
             if fit.message:
                 break
         # A single line leaks into none, and nothing says so to its slopes.
@@ -476,7 +476,7 @@ class JointEstimator(Estimator):
         self._belief.expect_leaks(leaks_us, stds_us)
         return self._fit_rest(ports, fit.log_cells, 1)  # to expect leaks has reset the wires
 
-    def _fit_rest(self, ports: PortReadings, log_cells: Float, fits: int = REST_FITS) -> FullFit:
+    def _fit_rest(self, ports: PortReadings, log_cells: Float, fits: int) -> FullFit:
         """The last of so many fits of the rest readings, from these cells (RC,)."""
         for _ in range(fits):
             self._belief.before_fit(log_cells, ports)
