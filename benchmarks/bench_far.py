@@ -3,9 +3,10 @@
 
     make bench-far
 
-Everything is simulated. Nobody is told the wires; rest readings are told, rounded as all
-readings are. `far`: readings a e b f. `near`: a b c d. Rounding takes the part of a code away, as a
-converter does, and estimators read the middle of its interval. What is measured how:
+Everything is simulated. Nobody is told the wires; that there are no leads is told, and rest
+readings are, rounded as all readings are. `far`: readings a e b f. `near`: a b c d. Rounding takes
+the part of a code away, as a converter does, and estimators read the middle of its interval. What
+is measured how:
 
 MODE_KIND_METHOD_*      scenes of tests/data/far, solved by ngspice: `random` (8x8 and 5x9, wires of
                         100 to 300 ohm a segment, up to 8 touches), `harsh` (the same at 1 to

@@ -14,6 +14,8 @@ total_*         sum of the rise of all cells over the true one: 10th and 90th pe
 error_*         error of a pressed cell, median and 90th percentile: of the first 50 frames, and of
                 those after a hundred.
 told_*_worst    the worst total where the wires are told: the nominal 100 and 200 ohm.
+nothing_*       total and error of all frames, and pressed cells within 4 stated deviations, where
+                nobody has told either that there are no leads. All other figures are told that.
 mixed_*         the same fingertips on skins with wires of 20 ohm to 1 kohm a segment, not told:
                 90th percentile of the total's error, pressed cells within 4 stated deviations.
 limit_*         90th percentile of the errors that one frame of them allows whoever knows which
@@ -34,7 +36,7 @@ from ohmskin.link.protocol import ADC_BITS
 from ohmskin.record.readings import estimate_file
 from studies.information import pressed_limits
 from studies.judge import Judged, judge_trial, pooled
-from studies.trials import NOMINAL_WIRE_OHM, Trial, finger_trial
+from studies.trials import NOMINAL_WIRE_OHM, Trial, finger_trial, without_leads
 
 METHODS = ("joint", "touch")
 SEED = 5000  # of the first skin
@@ -65,9 +67,12 @@ class Figures(dict[str, float]):
         self[name] = round(float(value), digits)
 
 
-def read(trial: Trial, method: str, *, wires_told: bool) -> dict[str, Judged]:
+def read(
+    trial: Trial, method: str, *, wires_told: bool, leads_told: bool = True
+) -> dict[str, Judged]:
     """What a method says of one skin's frames in order, by parts of them."""
-    answers = estimate_file(trial.rounded(ADC_BITS, wires_told=wires_told), method)
+    told = trial.rounded(ADC_BITS, wires_told=wires_told)
+    answers = estimate_file(told if leads_told else without_leads(told), method)
     return {name: judge_trial(answers, trial, part) for name, part in PARTS.items()}
 
 
@@ -82,6 +87,7 @@ def of_fingers(figures: Figures, method: str, skins: int) -> None:
             usual = fingertips(count, number, NOMINAL_WIRE_OHM)
             cases["untold"].append(read(usual, method, wires_told=False))
             cases["told"].append(read(usual, method, wires_told=True))
+            cases["nothing"].append(read(usual, method, wires_told=False, leads_told=False))
             top, bottom = np.exp(random.uniform(low, high, 2))
             mixed = fingertips(count, number, (float(top), float(bottom)))
             cases["mixed"].append(read(mixed, method, wires_told=False))
@@ -99,7 +105,13 @@ def of_case(figures: Figures, key: str, cases: dict[str, list[dict[str, Judged]]
     }
     figures.put(f"total_{key}_p10", np.quantile(total["untold"], 0.1), 3)
     figures.put(f"total_{key}_p90", np.quantile(total["untold"], 0.9), 3)
-    for case, word in (("untold", "total"), ("told", "told")):
+    figures.put(f"nothing_{key}_p10", np.quantile(total["nothing"], 0.1), 3)
+    figures.put(f"nothing_{key}_p90", np.quantile(total["nothing"], 0.9), 3)
+    figures.put(f"nothing_{key}_percent", judged["nothing"].error_percent())
+    figures.put(f"nothing_{key}_p90_percent", judged["nothing"].error_percent(0.9))
+    within_percent = judged["nothing"].pressed_within_percent()
+    figures.put(f"nothing_{key}_within_4_std_percent", within_percent)
+    for case, word in (("untold", "total"), ("told", "told"), ("nothing", "nothing")):
         worst = np.exp(np.abs(np.log(np.maximum(total[case], 1e-3))).max())
         figures.put(f"{word}_{key}_worst", worst, 3)
     for part in ("first", "late"):

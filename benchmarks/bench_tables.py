@@ -10,7 +10,7 @@ Everything is simulated. It prints:
   condition, cold. `joint` and `touch` are told rest readings and nominal wires, the others nothing.
   The wire sweep also with cells pressed to 0.1 megohm: docs/paper.md says why.
 - what becomes of a method that is told less: 20 random 8x8 skins of 20 frames, up to 8 touches, 10
-  bit, in order.
+  bit, in order. That there are no leads is told, but in the row that says so.
 - of the paper's methods: how many frames converge, how long they take, and how many converge to a
   wrong answer.
 """
@@ -45,6 +45,7 @@ from studies.trials import (
     random_trial,
     reference_trial,
     trial_of,
+    without_leads,
     without_wires,
 )
 
@@ -65,6 +66,7 @@ TOLD = {
     (False, True): "nominal wires",
     (False, False): "nothing",
 }
+LEADS_NEITHER = "nothing, leads neither"
 
 
 def papers(part: Part) -> tuple[str, ...]:
@@ -132,13 +134,15 @@ def print_told(part: Part) -> dict[str, dict[str, float]]:
         for number in range(part.of(SKINS))
     ]
     figures, rows = {}, []
-    cases = [("ohm", True, True), ("matrix", True, True)]
-    cases += [(method, *told) for method in OURS for told in TOLD]
-    for method, rest_told, wires_told in cases:
+    cases = [("ohm", True, True, True), ("matrix", True, True, True)]
+    for method in OURS:
+        cases += [*((method, *told, True) for told in TOLD), (method, False, False, False)]
+    for method, rest_told, wires_told, leads_told in cases:
         parts = []
         for trial in trials:
             told = trial.rounded(ADC_BITS, wires_told=wires_told)
             told = told if rest_told else replace(told, rest_ratio=None)
+            told = told if leads_told else without_leads(told)
             parts.append(judge_trial(estimate_file(told, method), trial))
         judged = pooled(parts)
         of_case = {
@@ -148,7 +152,8 @@ def print_told(part: Part) -> dict[str, dict[str, float]]:
             "within_4_std_percent": round(judged.within_percent(4), 1),
             "converged_percent": round(judged.converged_percent(), 1),
         }
-        name = TOLD[rest_told, wires_told] if method in OURS else "uses none of it"
+        name = TOLD[rest_told, wires_told] if leads_told else LEADS_NEITHER
+        name = name if method in OURS else "uses none of it"
         figures[f"{method}, {name}"] = of_case
         rows.append([f"`{method}`", name, *of_case.values()])
     headings = ["method", "told", "median error [%]", "90th percentile [%]"]

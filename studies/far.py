@@ -13,10 +13,10 @@ Readouts of the same frames of the same 8x8 skins (`trials`; random touches, or 
 `zero, solved`      `best scale`, the cells that explain all currents with the nominal wires
 =================== =======================================================================
 
-Rest readings are told, nominal wires only where a readout's line says so. Segments are spread by 10
-% about the nominal value. Estimators start each frame anew. Sweeps: `wires`, a segment of a row
-(one of a column has twice as much); `bend`, all wires are so many times those of the rest readings
-and of the nominal wires.
+Rest readings are told, and that there are no leads; nominal wires only where a readout's line says
+so. Segments are spread by 10 % about the nominal value. Estimators start each frame anew. Sweeps:
+`wires`, a segment of a row (one of a column has twice as much); `bend`, all wires are so many times
+those of the rest readings and of the nominal wires.
 """
 
 from __future__ import annotations

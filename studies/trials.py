@@ -123,6 +123,11 @@ def without_wires(given: Readings) -> Readings:
     return replace(given, nominal_top_wire_ohm=None, nominal_bottom_wire_ohm=None)
 
 
+def without_leads(given: Readings) -> Readings:
+    """These readings, where nobody knows that there are no leads: as of a board that tells none."""
+    return replace(given, nominal_lead_ohm=None)
+
+
 def skin_at_rest(
     rows: int,
     columns: int,

@@ -4,7 +4,7 @@
 import numpy as np
 
 from ohmskin.circuit.skin import all_readings, end_admittance
-from studies.trials import reference_trial
+from studies.trials import random_trial, reference_trial, without_leads
 
 
 def test_some_frames_of_a_file_in_mode_far() -> None:
@@ -18,3 +18,11 @@ def test_some_frames_of_a_file_in_mode_far() -> None:
     every = reference_trial("random_8x8")
     np.testing.assert_array_equal(picked.cell_siemens, every.cell_siemens[[3, 7]])
     np.testing.assert_array_equal(picked.readings.ratio, every.readings.ratio[[3, 7]])
+
+
+def test_that_there_are_no_leads_is_told_unless_it_is_taken_away() -> None:
+    """Figures of "nothing told" were told it, and are 1.3 to 2 times as good as without."""
+    told = random_trial(2, 3, 2, 1, 1).rounded(10, wires_told=False)
+    assert told.knowledge(0).nominal_wire_ohm.lead == 0.0
+    untold = without_leads(told).knowledge(0).nominal_wire_ohm
+    assert (untold.both, untold.lead) == (None, None)
