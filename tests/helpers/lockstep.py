@@ -23,6 +23,8 @@ from skins import scan_order
 
 CPU_HZ = 16_000_000
 CYCLES_PER_US = CPU_HZ // 1_000_000
+# Slots before the first scan, in which the converter begins: they stand at its first cell already.
+SLOTS_BEFORE = 2
 BOARDS = ("uno", "megaatmega2560")
 READINGS = tuple(protocol.ENUMS["reading"].values)
 TABLE_SHAPE = (16, 16, len(READINGS))
@@ -177,14 +179,6 @@ class ReceivedScan:
         )
         readings = np.array([READINGS.index(name) for name in protocol.MODES[mode]])
         return place, rows[place[0]], columns[place[1]], readings[place[2]]
-
-
-def first_of(holds: NDArray[np.void], scan: ReceivedScan) -> int:
-    """The first hold of the first scan: idle slots before it stand at its first cell already.
-
-    Two slots come before it, in which the converter begins.
-    """
-    return 2
 
 
 @dataclass(frozen=True)
@@ -372,8 +366,7 @@ class Rig(Closing):
         cycles = holds["cycle"].astype(np.int64)
         ticks = np.array([scan.header["time_us"] for scan in self.scans], np.int64) * CYCLES_PER_US
         # The board's clock and the simulator's begin at different times.
-        first = first_of(holds, self.scans[0])
-        due = ticks - ticks[0] + cycles[first]
+        due = ticks - ticks[0] + cycles[SLOTS_BEFORE]
         nearest = np.clip(np.searchsorted(cycles, due), 1, len(cycles) - 1)
         nearest -= due - cycles[nearest - 1] < cycles[nearest] - due
         wrong = self._wrong(holds, nearest)

@@ -10,7 +10,6 @@ skin scatters by 10 % about its layer's.
 
 from __future__ import annotations
 
-import inspect
 import io
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 import ohmskin
 from network import SkinCircuit
 from ohmskin.arrays import Bool, Float
-from ohmskin.cli.calibrate import recording as recording_command
 from ohmskin.cli.main import app
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.force.calibration import load_calibration
@@ -248,7 +246,7 @@ def calibrate(recording: Path, out: Path, method: str, told: WireOhm = NO_WIRES)
     arguments += ["--method", method]
     if told.both:
         arguments += ["--wires", ",".join(f"{ohm:g}" for ohm in told.both)]
-    if told.lead is not None and "leads" in inspect.signature(recording_command).parameters:
+    if told.lead is not None:
         arguments += ["--leads", f"{told.lead:g}"]
     with redirect_stdout(io.StringIO()) as said:
         app(arguments, standalone_mode=False)
