@@ -54,12 +54,11 @@ class Waiting:
             timer.cancel()
 
 
-class _Http(H11Protocol):
-    """A connection until its request is answered, or is found to ask for a websocket."""
+class _Waits(asyncio.Protocol):
+    """What both kinds of connections do beside uvicorn's own work."""
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self.app_state["waiting"].add(transport)
+    app_state: dict[str, Any]
+    transport: asyncio.Transport
 
     def connection_lost(self, exc: Exception | None) -> None:
         self.app_state["waiting"].remove(self.transport)
@@ -71,23 +70,21 @@ class _Http(H11Protocol):
         except Exception:  # of a parser, which no line on the terminal of the user explains
             self.transport.abort()
 
+
+class _Http(_Waits, H11Protocol):
+    """A connection until its request is answered, or is found to ask for a websocket."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.app_state["waiting"].add(transport)
+
     def send_400_response(self, msg: str) -> None:
         # What is no request has no answer: it may come amid that to the request before.
         self.transport.abort()
 
 
-class _WebSocket(WSProtocol):
+class _WebSocket(_Waits, WSProtocol):
     """A connection that has asked for a websocket; it waits until it is accepted."""
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self.app_state["waiting"].remove(self.transport)
-        super().connection_lost(exc)
-
-    def data_received(self, data: bytes) -> None:
-        try:
-            super().data_received(data)
-        except Exception:  # as above
-            self.transport.abort()
 
     async def send(self, message: Any) -> None:
         await super().send(message)

@@ -186,23 +186,20 @@ def _listen(host: str, port: int | None) -> socket.socket:
     :raises OhmskinError: the address cannot be had.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    if port is not None:
-        try:
-            return socket.create_server((host, port), family=family)
-        except OSError as exc:
-            problem = f"{host} port {port} cannot be had: {exc.strerror or exc}"
-            remedy = "say another with --http-port; 0 is any that is free"
-            if isinstance(exc, socket.gaierror):
-                remedy = "say another with --host"
-            raise OhmskinError(problem, remedy) from exc
-    for tried in range(HTTP_PORT, HTTP_PORT + _PORTS_TRIED):
+    first, count = (HTTP_PORT, _PORTS_TRIED) if port is None else (port, 1)
+    failures: list[OSError] = []
+    for tried in range(first, first + count):
         try:
             return socket.create_server((host, tried), family=family)
-        except socket.gaierror:
-            break  # a name without an address has none at the next port either
-        except OSError:
-            continue
-    return _listen(host, HTTP_PORT)  # raises an error that says why
+        except OSError as exc:
+            failures.append(exc)
+            if isinstance(exc, socket.gaierror):
+                break  # a name without an address has none at the next port either
+    problem = f"{host} port {first} cannot be had: {failures[0].strerror or failures[0]}"
+    remedy = "say another with --http-port; 0 is any that is free"
+    if isinstance(failures[0], socket.gaierror):
+        remedy = "say another with --host"
+    raise OhmskinError(problem, remedy) from failures[0]
 
 
 def serve(
