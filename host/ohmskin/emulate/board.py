@@ -155,7 +155,7 @@ class EmulatedBoard:
         self._sequence = 0
         self._rate_mhz = 0  # what the answer to the present command says
         self._scan = 0
-        self._first = 0  # number of the first scan that is as long as the one in progress
+        self._cycles = 0  # from the start of scans to that of the one in progress
         self._whole = False  # whether the scan in progress is a whole one
         self._until_whole = 0  # how many scans come before the next whole one
         self._waited = False  # whether that one has let a region go first
@@ -168,11 +168,7 @@ class EmulatedBoard:
         """When the scan in progress ends [s]; None if there is none."""
         if self._started_s is None:
             return None
-        return self._started_s + (self._scan - self._first + 1) * self._period_s
-
-    @property
-    def _period_s(self) -> float:
-        return self._plan.cycles / CLOCK_HZ
+        return self._started_s + (self._cycles + self._plan.cycles) / CLOCK_HZ
 
     @property
     def _plan(self) -> "ScanPlan":
@@ -183,7 +179,7 @@ class EmulatedBoard:
         """Let time pass until `now_s`. Returns what the board has sent since the last call."""
         while (end := self.next_scan_s) is not None and end <= now_s:
             self.now_s = end
-            self._send_scan(end - self._period_s)
+            self._send_scan(end - self._plan.cycles / CLOCK_HZ)
         self.now_s = max(self.now_s, now_s)
         sent, self._out = bytes(self._out), bytearray()
         if self._next_baud is not None:
@@ -240,8 +236,8 @@ class EmulatedBoard:
             case "start" if not scanning:
                 if (refusal := self._plan_again()) is not None:
                     return refusal
-                self._started_s, self._scan, self._first = self.now_s, 0, 0
-                self._until_whole = 0
+                self._started_s = self.now_s
+                self._scan = self._cycles = self._until_whole = 0
                 self._take_turn()
                 self.on_start(self.now_s)
             case "stop" if scanning:
@@ -290,7 +286,7 @@ class EmulatedBoard:
 
     def _take_turn(self) -> None:
         """Decide which scan begins now: one of the region, or a whole one."""
-        before, every = self._plan, self.settings["whole_every"]
+        every = self.settings["whole_every"]
         if self._plans is not self._next_plans and not (self._until_whole or self._waited):
             # A whole scan that is due lets one scan of a new region go first, as in the firmware.
             self._until_whole, self._waited = 1, True
@@ -299,10 +295,6 @@ class EmulatedBoard:
         self._whole = every > 0 and self._until_whole == 0
         self._waited &= not self._whole
         self._until_whole = every - 1 if self._whole else max(self._until_whole - 1, 0)
-        if self._plan.cycles != before.cycles and self._started_s is not None:
-            # Times are counted from the first scan of this length: rounding does not add up then.
-            self._started_s += (self._scan - self._first) * before.cycles / CLOCK_HZ
-            self._first = self._scan
 
     def _time_us(self, time_s: float) -> int:
         return round((time_s - self.boot_s) * 1e6) % _SCAN.span("time_us")
@@ -344,6 +336,7 @@ class EmulatedBoard:
             slot_cycles=plan.slot_cycles,
         )
         self._scan += 1
+        self._cycles += plan.cycles
         self._take_turn()
 
     def _send_hello(self) -> None:
