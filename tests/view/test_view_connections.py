@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.request import urlopen
 
 import pytest
@@ -19,7 +19,7 @@ from calibrations import of_scene
 from command_line import ENVIRONMENT, Command, Done, finish, python
 from ohmskin.view import connections, server
 from ohmskin.view.boards import ViewedBoard, ViewedBoards
-from ohmskin.view.connections import MOST_WAITING
+from ohmskin.view.connections import MOST_WAITING, Waiting
 from ohmskin.view.panel import MOST_COMMANDS
 from ohmskin.view.server import make_app
 from places import ROOT
@@ -142,6 +142,42 @@ def test_messages_are_not_unpacked(command: Command) -> None:
             answer = connection.recv(4096).partition(b"\r\n\r\n")[0].lower()
     assert b"101" in answer
     assert b"deflate" not in answer
+
+
+def test_a_websocket_that_was_closed_for_its_message_is_gone() -> None:
+    """uvicorn raised a RuntimeError, as for a defect, where a scan was sent after that."""
+    told: list[Any] = []
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "lifespan":
+            await receive()
+            scope["state"]["waiting"] = Waiting()
+            await send({"type": "lifespan.startup.complete"})
+            await receive()
+            return
+        await receive()
+        await send({"type": "websocket.accept"})
+        told.append((await receive())["code"])
+        try:
+            await send({"type": "websocket.send", "text": ""})
+        except OSError as gone:
+            told.append(gone)
+
+    limited = connections.Server(app, longest_message_bytes=100, shutdown_s=1)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=limited.run, args=([listening],))
+        thread.start()
+        masked = b"\x81" + bytes([0x80 | 126, 0, 126]) + bytes(4) + 126 * b"x"
+        asks = f"GET / HTTP/1.1\r\nHost: a\r\n{UPGRADE}{KEY}\r\n".encode()
+        with connect(listening.getsockname()[1], asks) as connection:
+            assert b" 101 " in connection.recv(4096)
+            connection.sendall(masked)
+            while connection.recv(4096):
+                pass
+        limited.should_exit = True
+        thread.join(LIMIT_S)
+    assert told[0] == 1009
+    assert isinstance(told[1], OSError)
 
 
 def test_commands_of_a_page_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:

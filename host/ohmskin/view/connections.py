@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
 from wsproto.events import Ping
 
@@ -87,6 +88,11 @@ class _WebSocket(_Waits, WSProtocol):
     """A connection that has asked for a websocket; it waits until it is accepted."""
 
     async def send(self, message: Any) -> None:
+        await self.writable.wait()
+        # The server closes it after a message that is too long. If a scan is sent after that,
+        # uvicorn would raise what it raises for a defect of the program.
+        if self.close_sent:
+            raise ClientDisconnected
         await super().send(message)
         if message["type"] == "websocket.accept":
             self.app_state["waiting"].remove(self.transport)

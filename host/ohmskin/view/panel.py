@@ -11,7 +11,7 @@ clock.
 import asyncio
 import json
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
@@ -79,24 +79,10 @@ class Panel:
                 await self._say("state", **state)
             if shown is not None and shown is not self._sent and self._awaited is None:
                 self._sent, self._awaited = shown, shown.number
-                await self._deliver(self._socket.send_bytes(shown.message))
+                await self._socket.send_bytes(shown.message)
 
     async def _say(self, kind: str, **content: Any) -> None:
-        await self._deliver(self._socket.send_text(json.dumps({"kind": kind, **content})))
-
-    async def _deliver(self, sending: Awaitable[None]) -> None:
-        """Send. If the server has closed the connection, raise as if the page had closed it.
-
-        The server does so after a message that is too long, and `receive` tells it to the other
-        task. If a scan is sent before that, starlette raises a RuntimeError, and only the text of
-        this error shows that the connection was closed.
-        """
-        try:
-            await sending
-        except RuntimeError as exc:
-            if "after sending 'websocket.close'" in str(exc):
-                raise WebSocketDisconnect(GONE_CODE) from exc
-            raise
+        await self._socket.send_text(json.dumps({"kind": kind, **content}))
 
     async def _receive(self, tasks: TaskGroup) -> None:
         while True:
