@@ -77,7 +77,8 @@ _MODULES = {
     "several_boards": ("BoardScan", "Boards", "open_all"),
     "version": ("__version__",),
 }
-__all__ = [name for names in _MODULES.values() for name in names if name != "__version__"]
+if not TYPE_CHECKING:  # a type checker reads no list that is computed: it goes by the imports
+    __all__ = [name for names in _MODULES.values() for name in names if name != "__version__"]
 
 
 def __getattr__(name: str) -> "Any":
@@ -92,4 +93,4 @@ def __getattr__(name: str) -> "Any":
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *(name for names in _MODULES.values() for name in names)})

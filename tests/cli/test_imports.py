@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is loaded when: the package and its help are light, and methods load what they need."""
 
+import ast
 import signal
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 
@@ -71,6 +74,19 @@ def test_every_public_name_is_found() -> None:
         assert getattr(ohmskin, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'oepn'"):
         _ = ohmskin.oepn
+
+
+def test_a_type_checker_finds_the_same_public_names_from_the_same_modules() -> None:
+    tree = ast.parse(Path(ohmskin.__file__).read_text())
+    (block,) = (node for node in tree.body if isinstance(node, ast.If) and len(node.body) > 1)
+    imports = [node for node in block.body if node.module.startswith("ohmskin.")]
+    checked = {name.asname: node.module for node in imports for name in node.names}
+    assert checked.keys() == {*ohmskin.__all__, "__version__"}
+    for name, module in checked.items():
+        assert getattr(import_module(module), name) is getattr(ohmskin, name)
+    # A list that it cannot compute would leave nothing for `from ohmskin import *`.
+    assigned = [node.targets[0].id for node in tree.body if isinstance(node, ast.Assign)]
+    assert "__all__" not in assigned
 
 
 @pytest.mark.parametrize("name", app.commands)
