@@ -147,7 +147,7 @@ class TwoBadLines(AbstractContextManager["TwoBadLines"]):
 def test_lines_of_the_scale_that_could_not_be_read_are_counted(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ohmskin.cli.calibrate.ForceSensor", TwoBadLines)
+    monkeypatch.setattr("ohmskin.cli.record.ForceSensor", TwoBadLines)
     command = ("calibrate", "knead", f"{SKIN}&scene=knead", str(tmp_path / "skin.json"))
     done = run(*command, "--force-port", "scale", "--seconds", "3")
     assert "0 forces, 2 lines that could not be read: 0 of 6 cells" in done.out

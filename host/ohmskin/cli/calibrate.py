@@ -31,7 +31,6 @@ from ohmskin.cli.record import (
     ForceColumn,
     ForceScale,
     ForceUnit,
-    is_truth,
     progress,
 )
 from ohmskin.cli.scale import grams_of, scale
@@ -52,7 +51,7 @@ from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.link.device import Device, mean_ratio, scans_for
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import all_lines
-from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS, ForceSensor
+from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recording, Tare, load_recording
 
@@ -281,13 +280,8 @@ def knead(
     Ctrl-C ends it with what there is. The same command goes on: all recordings beside OUT count.
     """
     calibrator_of = _options(out, method, None, wires_of(wires, leads), force)
-
-    def sensor_of(skin: Device) -> ForceSensor | None:
-        if is_truth(force_port, skin):
-            return None
-        return ForceSensor(force_port, force_baud, force_scale, force_unit, force_column)
-
-    given, known = kneaded(port, out, sensor_of, seconds)
+    said = force_port, force_baud, force_scale, force_unit, force_column
+    given, known = kneaded(port, out, said, seconds)
     try:
         if not any(each.scans and each.tares for each in given):
             raise ValueError("no recording has a rest, and touches after it")

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin calibrate knead``: press a skin anywhere, over a scale, until all cells are known."""
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from itertools import takewhile
 from pathlib import Path
@@ -17,7 +16,7 @@ from ohmskin.calibrate.coverage import KNOWN_LOG, LEAST_N, LiveCoverage
 from ohmskin.calibrate.rules import check_complete
 from ohmskin.calibrate.sessions import check_same, session_paths
 from ohmskin.cli.board import TERMINAL, asked_for
-from ohmskin.cli.record import FORCE_TARE_S, unread, with_truth
+from ohmskin.cli.record import FORCE_TARE_S, sensor_at, unread, with_truth
 from ohmskin.cli.stream import cell_table
 from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.errors import DeviceLost, TareRefused
@@ -83,12 +82,11 @@ class KneadMap:
 
 
 def kneaded(
-    port: str, out: Path, sensor_of: Callable[[Device], ForceSensor | None], seconds: float
+    port: str, out: Path, scale: tuple[str, int, float, str, str], seconds: float
 ) -> tuple[list[Recording], bool]:
     """What was kneaded before, and now, until all cells are known or Ctrl-C comes.
 
-    sensor_of: opens the force sensor; None: the skin knows the truth. Returns all recordings, and
-    whether all cells are known.
+    scale: as `sensor_at` takes it. Returns all recordings, and whether all cells are known.
     """
     before, path = session_paths(out, "knead")
     recordings = [load_recording(each) for each in before]
@@ -103,7 +101,7 @@ def kneaded(
             coverage.ask_more()
         if not coverage.known.all():
             try:
-                goes_on = _knead(skin, path, sensor_of(skin), coverage, seconds)
+                goes_on = _knead(skin, path, sensor_at(skin, *scale), coverage, seconds)
             except TareRefused:
                 path.unlink()
                 raise

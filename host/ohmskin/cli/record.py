@@ -91,11 +91,10 @@ def record(
         tare_s = FORCE_TARE_S if force_port else 0.0
     with ExitStack() as stack:
         skin = stack.enter_context(ohmskin.open(port, start=False))
-        sensor = None
-        if force_port and not is_truth(force_port, skin):
-            said = force_baud, force_scale, force_unit, force_column
-            sensor = stack.enter_context(ForceSensor(force_port, *said))
-            sensor.wait()
+        said = force_port, force_baud, force_scale, force_unit, force_column
+        sensor = sensor_at(skin, *said) if force_port else None
+        if sensor is not None:
+            stack.enter_context(sensor).wait()
         recorder = stack.enter_context(Recorder(file, skin.info, lambda: skin.now_s))
         for text in mark or ():
             recorder.add(Mark(text, recorder.now_s()))
@@ -136,11 +135,16 @@ def unread(sensor: ForceSensor | None) -> str:
     return f", {sensor.damaged} lines that could not be read"
 
 
-def is_truth(force_port: str, skin: Device) -> bool:
-    """Whether the port is `TRUTH`. Raises ValueError where the skin knows none."""
-    if force_port == TRUTH and skin.true_force_n is None:
+def sensor_at(
+    skin: Device, port: str, baud: int, scale: float, unit: str, column: str
+) -> ForceSensor | None:
+    """The force sensor at a port; None: the port is `TRUTH`, which this skin knows.
+
+    Raises ValueError where the skin knows no truth.
+    """
+    if port == TRUTH and skin.true_force_n is None:
         raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
-    return force_port == TRUTH
+    return None if port == TRUTH else ForceSensor(port, baud, scale, unit, column)
 
 
 def with_truth(scans: Iterable[Scan], skin: Device, recorder: Recorder) -> Iterator[Scan]:
