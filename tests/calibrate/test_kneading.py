@@ -2,6 +2,7 @@
 """``calibrate recording --total``: curves of all cells from the force on the whole skin."""
 
 import json
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,11 @@ from command_line import Run, assert_one_line, well
 from kneaded_skin import KneadedSkin
 from kneaded_skin import Scale as ScaleBelow
 from ohmskin.arrays import Float
+from ohmskin.calibrate.kneading import Kneading
+from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.scale import Scale, fit_scale, printed_s, wrong_numbers
+from ohmskin.calibrate.sessions import joined
+from ohmskin.calibrate.tables import ForceLog
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan
@@ -329,6 +334,33 @@ def test_a_skin_that_was_kneaded_reads_forces(skin: KneadedSkin, run: Run, tmp_p
     forces = skin.read(out)
     assert forces.rmse_n() < 0.6
     assert forces.within_percent() > 97
+
+
+def test_a_rest_that_has_moved_between_recordings_is_no_force(
+    skin: KneadedSkin, tmp_path: Path
+) -> None:
+    """Readings were moved to the newest rest, which is not exact beside a touch."""
+    path, out, middle_s = tmp_path / "knead.mcap", tmp_path / "skin.json", 25.0
+    before = copy(skin)
+    times = np.random.default_rng(7).uniform(1.0, 3.0, skin.rest.shape)
+    before.rest = replace(skin.rest, cell_siemens=times * skin.rest.cell_siemens)
+    both = []
+    for half, of_day in enumerate((before, skin)):
+        of_day.record_kneading(path, ScaleBelow(10.0, 0.05, 0.1, 0.01, 0.1))
+        given = load_recording(path)
+        path.unlink()
+        given.scans = [each for each in given.scans if each.host_time_s // middle_s == half]
+        given.forces = [each for each in given.forces if each.host_time_s // middle_s == half]
+        both.append(given)
+    whole = joined(both)
+    calibrator = Calibrator(whole[-1].hellos[0], whole[-1].tares[0].rest_ratio, "joint", None)
+    kneading = Kneading(calibrator, whole)
+    forces = [(each.host_time_s, each.force_n) for given in whole for each in given.forces]
+    time_s, force_n = np.transpose(forces)
+    fit = kneading.learn(ForceLog(time_s, force_n, any_zero=True))
+    calibrator.calibration_of(fit.model(kneading.shape), fit.largest_n).save(out)
+    assert fit.presses_left_out == 0
+    assert skin.read_tips(out).rmse_n() < 0.08  # where the rest stays, it is 0.065
 
 
 def test_hysteresis_and_unseen_force_are_not_taken_for_wires() -> None:

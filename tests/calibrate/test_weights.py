@@ -271,7 +271,7 @@ def test_scans_that_came_in_one_read_have_one_force_of_a_weight(tmp_path: Path) 
     assert [force.host_time_s for force in given.forces] == times_s
     # So it is with recordings of before.
     given.forces = [force for force in given.forces for _ in range(2)]
-    assert len(joined([given]).forces) == len(times_s)
+    assert len(joined([given])[0].forces) == len(times_s)
 
 
 def test_all_presses_can_be_redone(weigh: Run, tmp_path: Path) -> None:

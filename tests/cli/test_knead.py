@@ -219,9 +219,9 @@ def test_a_recording_that_has_no_scans_spoils_no_other() -> None:
     scans = list(islice(bench, 3))
     tare = Tare(scans[0].ratio, scans[0].host_time_s)
     good = Recording([bench.info], scans, [tare], [], [], cut_off=False)
-    whole = joined([good, Recording([bench.info], [], [], [], [], cut_off=False)])
-    assert len(whole.scans) == 3
-    assert whole.tares == [tare]
+    (only,) = joined([good, Recording([bench.info], [], [], [], [], cut_off=False)])
+    assert len(only.scans) == 3
+    assert only.tares == [tare]
 
 
 def test_the_map_shows_each_cell_and_where_to_press_next(

@@ -30,6 +30,7 @@ learns them from frames of several touches.
 """
 
 from dataclasses import replace
+from itertools import groupby
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -48,7 +49,7 @@ from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import UNLIMITED_STD, USUAL_LEAD_STD_OHM
 from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.clock import scan_times_s
-from ohmskin.link.messages import Scan
+from ohmskin.record.recording import Recording
 
 # Of the scans of a press, those are estimated that are so far apart [s]. Chosen: a finger comes, or
 # goes, within four of them.
@@ -87,32 +88,45 @@ class _Levels(NamedTuple):
     """What an estimator shows of the scans.
 
     rise: x, (n, C); 0 where nothing is pressed.
-    rest: level of the untouched cells, (R, C) [S].
+    rest: level of the untouched cells in each recording, (k, C) [S].
     used: which scans were used, (n,).
+    estimator: the one that has read the last recording.
     """
 
     rise: Float
     rest: Float
     used: Bool
+    estimator: Estimator
 
 
 class Kneading:
     """Scans of presses anywhere, by which a calibrator learns.
+
+    recordings: one after another, by one clock. Each is read above its own rest, which is its first
+        tare; the rest of the last one is that of the calibrator.
 
     time_s: time of each scan, (n,) [s].
     of_skin: rise of the currents of all ports together, (n,) [S].
     shape: (R, C).
     """
 
-    def __init__(self, calibrator: Calibrator, scans: list[Scan]) -> None:
-        self._calibrator, self._scans = calibrator, scans
-        self.shape = calibrator.knowledge.rows, calibrator.knowledge.columns
-        knowledge = calibrator.knowledge
-        assert knowledge.rest_ratio is not None
-        self._reader = PortReader(knowledge)
-        rest = self._reader.read(knowledge.rest_ratio).current
-        currents = [self._reader.read(scan.ratio, in_order=True).current for scan in scans]
-        rise = (np.array(currents) - rest).reshape(len(scans), -1)
+    def __init__(self, calibrator: Calibrator, recordings: list[Recording]) -> None:
+        self._calibrator, knowledge = calibrator, calibrator.knowledge
+        self.shape = knowledge.rows, knowledge.columns
+        rests = [given.tares[0].rest_ratio for given in recordings[:-1]]
+        self._knowledge = [*(replace(knowledge, rest_ratio=rest) for rest in rests), knowledge]
+        self._scans = scans = [scan for given in recordings for scan in given.scans]
+        numbers = np.arange(len(recordings))
+        self._recording = np.repeat(numbers, [len(given.scans) for given in recordings])
+        currents = []
+        for known, given in zip(self._knowledge, recordings, strict=True):
+            reader = PortReader(known)
+            assert known.rest_ratio is not None
+            rest = reader.read(known.rest_ratio).current
+            currents += [
+                reader.read(scan.ratio, in_order=True).current - rest for scan in given.scans
+            ]
+        rise = np.array(currents).reshape(len(scans), -1)
         rises = rise > TOUCH_SIEMENS
         self.time_s = scan_times_s(scans)
         self._weighed: Bool | None = None  # scans whose force is known, if the scale does not lag
@@ -133,7 +147,9 @@ class Kneading:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
         if not calibrator.shows_wires:
             calibrator.take_wires(self._found_wires(log))
-        levels = self._levels(calibrator.estimator, self._spaced(), progress)
+        wires = calibrator.knowledge.nominal_wire_ohm
+        levels = self._levels(calibrator.method, wires, self._spaced(), progress)
+        calibrator.estimator = levels.estimator
         return TotalFit(self._totals(levels, log)).fit()
 
     def _spaced(self) -> Bool:
@@ -156,8 +172,7 @@ class Kneading:
 
     def _found_wires(self, log: ForceLog) -> FoundWires:
         """The wires with which one curve and gains fit the totals best."""
-        knowledge = self._calibrator.knowledge
-        told = knowledge.nominal_wire_ohm
+        told = self._calibrator.knowledge.nominal_wire_ohm
         centre, std = (of_wires[:2] for of_wires in wire_prior(told))
         lead_ohm, lead_std_ohm = told.lead_or_usual(USUAL_LEAD_STD_OHM)
         w, scale = centre, None
@@ -169,9 +184,8 @@ class Kneading:
             wires = WireOhm(
                 top_ohm, bottom_ohm, lead_ohm, TRIAL_LOG_STD, TRIAL_LOG_STD, lead_std_ohm
             )
-            estimator = make_estimator(DEFAULT_METHOD, replace(knowledge, nominal_wire_ohm=wires))
-            levels = self._levels(estimator, used)
-            wires = estimator.wires()
+            levels = self._levels(DEFAULT_METHOD, wires, used)
+            wires = levels.estimator.wires()
             lead_ohm = wires.lead or 0.0
             prior = WireSlopes(self._slopes(wires, levels), centre - w, std)
             fit = TotalFit(self._totals(levels, log), prior, scale).fit()
@@ -187,22 +201,38 @@ class Kneading:
         found = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std)
         return FoundWires(found, told, fit.presses, ())
 
-    def _levels(self, estimator: Estimator, used: Bool, progress: Progress = iter) -> _Levels:
-        """What an estimator shows of the scans to use, (n,); those that it doubts are left out."""
+    def _levels(
+        self, method: str, wires: WireOhm, used: Bool, progress: Progress = iter
+    ) -> _Levels:
+        """What a method shows of the scans to use, (n,); those that it doubts are left out.
+
+        wires: what is known of them. What the presses of a recording teach of them is known in the
+            next one; far ends show the wires of each recording anew.
+        """
         pressed = self._press >= 0
         pauses = np.flatnonzero(used & ~pressed)
         wanted = used & pressed
         wanted[pauses[:: pauses.size // PAUSE_SCANS + 1]] = True
-        rest = estimator.rest_level()
-        rise, good = np.zeros((used.size, rest.size)), used.copy()
+        cells, estimator = self.shape[0] * self.shape[1], self._calibrator.estimator
+        rise, good = np.zeros((used.size, cells)), used.copy()
+        rests = np.zeros((len(self._knowledge), cells))
         numbers = np.flatnonzero(wanted)
-        for n, scan in zip(numbers, progress([self._scans[n] for n in numbers]), strict=True):
-            answer = estimator.estimate(scan.ratio)
-            good[n], rise[n] = answer.converged, (answer.level - rest).ravel()
+        scans = zip(numbers, progress([self._scans[n] for n in numbers]), strict=True)
+        for recording, given in groupby(scans, lambda scan: self._recording[scan[0]]):
+            knowledge = replace(self._knowledge[recording], nominal_wire_ohm=wires)
+            estimator = make_estimator(method, knowledge)
+            rest = rests[recording] = estimator.rest_level().ravel()
+            for n, scan in given:
+                answer = estimator.estimate(scan.ratio)
+                good[n], rise[n] = answer.converged, answer.level.ravel() - rest
+            if not self._calibrator.shows_wires:
+                wires = estimator.wires()
         of_nothing = rise[good & wanted & ~pressed].max(axis=1, initial=0.0)
         least = PAUSE_TIMES * float(np.median(of_nothing)) if of_nothing.size else 0.0
         rise[(rise < min(least, TOUCH_SIEMENS)) | ~pressed[:, None]] = 0.0
-        return _Levels(rise, rest, good if self._weighed is None else good & self._weighed)
+        if self._weighed is not None:
+            good &= self._weighed
+        return _Levels(rise, rests, good, estimator)
 
     def _totals(self, levels: _Levels, log: ForceLog) -> Totals:
         """What skin and scale have shown.
@@ -247,10 +277,10 @@ class Kneading:
         knowledge = self._calibrator.knowledge
         assert wires.both is not None
         series_ohm = knowledge.ref_ohm + 2 * (wires.lead or 0.0)
-        rises = levels.rise[levels.used]
+        rises, rests = levels.rise[levels.used], levels.rest[self._recording[levels.used]]
         slopes = np.zeros((2, *rises.shape))
         for n in np.flatnonzero(rises.any(axis=1)):
-            siemens = np.maximum(rises[n] + levels.rest.ravel(), MIN_CELL_SIEMENS)
+            siemens = np.maximum(rises[n] + rests[n], MIN_CELL_SIEMENS)
             circuit = PortCircuit(siemens.reshape(self.shape), *wires.both)
             weight = (circuit.port_ohm + series_ohm)[:, None] ** -2.0 / knowledge.current_std
             pressed = rises[n] > 0

@@ -53,7 +53,7 @@ from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import all_lines
 from ohmskin.record.force_sensor import DEFAULT_BAUD, NEWTONS
 from ohmskin.record.recorder import Recorder
-from ohmskin.record.recording import Recording, Tare, load_recording
+from ohmskin.record.recording import ForceSample, Recording, Tare, load_recording
 
 # After a person is asked to let go, so much time passes before rest is measured [s]. Chosen: long
 # enough to let go.
@@ -187,7 +187,7 @@ def _weigh_anywhere(port: str, out: Path, forces_n: Float, calibrator_of: _Calib
             TERMINAL.print(f"{done}: the same command goes on")
             raise typer.Exit(130)
         recordings.append(load_recording(path))
-    _learn_totals(calibrator_of, joined(recordings), out)
+    _learn_totals(calibrator_of, recordings, out)
 
 
 @calibrate.command()
@@ -238,9 +238,9 @@ def recording(
         board = replace(board, mode=modes.pop(), row_mask=rows, column_mask=columns)
         calibrator = calibrator_of(board, _rest_ratio(given, rest_s))
         if total:
-            _knead(calibrator, given, log, out, as_json)
+            _knead(calibrator, [given], log, out, as_json)
             return
-        log = log or _log_in(given)
+        log = log or _log_in(given.forces)
         history = calibrator.look(given.scans, progress("presses"))
         alignment = align(history.time_s, history.of_skin, log)
         presses = find_presses(history, log, alignment.offset_s)
@@ -283,9 +283,7 @@ def knead(
     said = force_port, force_baud, force_scale, force_unit, force_column
     given, known = kneaded(port, out, said, seconds)
     try:
-        if not any(each.scans and each.tares for each in given):
-            raise ValueError("no recording has a rest, and touches after it")
-        _learn_totals(calibrator_of, joined(given), out)
+        _learn_totals(calibrator_of, given, out)
     except ValueError as exc:
         if known or seconds:
             raise
@@ -295,33 +293,35 @@ def knead(
         TERMINAL.print("not all cells are known yet: the same command goes on")
 
 
-def _learn_totals(calibrator_of: _CalibratorOf, given: Recording, out: Path) -> None:
+def _learn_totals(calibrator_of: _CalibratorOf, recordings: list[Recording], out: Path) -> None:
     """Write the calibration that the forces on the whole skin teach."""
-    calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, 0.0))
-    _knead(calibrator, given, None, out, as_json=False)
+    usable = joined(recordings)
+    calibrator = calibrator_of(usable[-1].hellos[-1], _rest_ratio(usable[-1], 0.0))
+    _knead(calibrator, usable, None, out, as_json=False)
 
 
-def _log_in(given: Recording, *, any_zero: bool = False) -> ForceLog:
-    """The forces in a recording, whose times are by the same clock as those of the scans."""
-    samples = np.array([(sample.host_time_s, sample.force_n) for sample in given.forces])
-    time_s, force_n = samples.T
-    if not {sample.source for sample in given.forces} & {WEIGHTS, TRUTH}:
+def _log_in(forces: list[ForceSample], *, any_zero: bool = False) -> ForceLog:
+    """The forces in recordings, whose times are by the same clock as those of the scans."""
+    time_s, force_n = np.array([(sample.host_time_s, sample.force_n) for sample in forces]).T
+    if not {sample.source for sample in forces} & {WEIGHTS, TRUTH}:
         time_s = printed_s(time_s)
     return ForceLog(time_s, force_n, any_zero=any_zero)
 
 
 def _knead(
-    calibrator: Calibrator, given: Recording, log: ForceLog | None, out: Path, as_json: bool
+    calibrator: Calibrator, given: list[Recording], log: ForceLog | None, out: Path, as_json: bool
 ) -> None:
     """Learn from the total force, write the calibration, and say what came of it.
 
-    log: forces whose times are by another clock; None: the forces in the recording are taken.
+    given: as `Kneading` takes them.
+    log: forces whose times are by another clock; None: the forces in the recordings are taken.
     """
-    kneading, offset_s, late_s = Kneading(calibrator, given.scans), 0.0, 0.0
+    kneading, offset_s, late_s = Kneading(calibrator, given), 0.0, 0.0
+    forces = [sample for each in given for sample in each.forces]
     is_apart = log is not None
-    lags = is_apart or any(sample.source != WEIGHTS for sample in given.forces)
+    lags = is_apart or any(sample.source != WEIGHTS for sample in forces)
     if log is None:
-        log = _log_in(given, any_zero=True)
+        log = _log_in(forces, any_zero=True)
     wrong = wrong_numbers(log.force_n) & lags
     log = ForceLog(log.time_s[~wrong], log.force_n[~wrong], any_zero=True)
     if is_apart:
