@@ -5,6 +5,7 @@ import os
 import re
 import signal
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -81,6 +82,31 @@ def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
     assert known[-1] < now[-1]
     assert len(list(tmp_path.glob("skin.knead-*.mcap"))) == 2
     assert load_calibration(out).model.slope_std.max() < first.model.slope_std.max()
+
+
+def test_a_press_that_is_left_out_is_named_by_its_recording(run: Run, tmp_path: Path) -> None:
+    """Its time was that since the first recording began, with pauses that were made up."""
+    out = tmp_path / "skin.json"
+    command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3", str(out), *TRUTH)
+    for _ in range(2):
+        well(run(*command, "--seconds", "11"))
+    path = tmp_path / "skin.knead-2.mcap"
+    given = load_recording(path)
+    begin_s = given.scans[0].host_time_s
+    pressed_s = [f.host_time_s - begin_s for f in given.forces if f.force_n > 1.0]
+    at_s = next(time_s for time_s in pressed_s if time_s > 4.0)
+    path.unlink()
+    with Recorder(path, given.hellos[0]) as recorder:
+        for message in [*given.tares, *given.scans]:
+            recorder.add(message)
+        for force in given.forces:
+            beside_n = 5.0 * (abs(force.host_time_s - begin_s - at_s) < 0.3)
+            recorder.add(replace(force, force_n=force.force_n + beside_n))
+    done = well(run(*command, "--seconds", "3"))
+    spans = re.findall(r"left out: (\S+), (\S+) to (\S+) s, force beside", done.out)
+    times_s = [(float(begin), float(end)) for name, begin, end in spans if name == path.name]
+    assert any(begin_s - 0.1 < at_s < end_s + 0.1 for begin_s, end_s in times_s)
+    assert all(float(end) < 12.0 for _, _, end in spans)
 
 
 @pytest.mark.parametrize("ends", [20, 60, 90], ids=["amid the tare", "unpressed", "pressed once"])

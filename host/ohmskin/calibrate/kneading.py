@@ -152,6 +152,11 @@ class Kneading:
         calibrator.estimator = levels.estimator
         return TotalFit(self._totals(levels, log)).fit()
 
+    def recording_at(self, time_s: float) -> tuple[int, float]:
+        """Number of the recording that has a scan of this time, and the time of its first [s]."""
+        number = self._recording[np.searchsorted(self.time_s, time_s)]
+        return int(number), float(self.time_s[np.searchsorted(self._recording, number)])
+
     def _spaced(self) -> Bool:
         """Which scans to use, (n,): pauses, ends of presses, and at most `MOST_SCANS` others."""
         counts = np.cumsum(self._press >= 0)

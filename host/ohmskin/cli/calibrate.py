@@ -333,11 +333,13 @@ def _knead(
     lag_s = fit.scale_.lag_s - late_s
     calibration = calibrator.calibration_of(fit.model(), fit.largest_n)
     calibration.save(out)
-    first_s, stds = kneading.time_s[0], fit.gain_std()
-    left_out = [[begin - first_s, end - first_s] for begin, end in fit.left_out]
+    stds, left_out = fit.gain_std(), []
+    for begin_s, end_s in fit.left_out:
+        number, first_s = kneading.recording_at(begin_s)
+        left_out.append((given[number].name, begin_s - first_s, end_s - first_s))
     known = int(np.count_nonzero(~calibration.model.pooled))
     if as_json:
-        said = {"left_out": left_out, "lag_s": lag_s, "offset_s": offset_s}
+        said = {"left_out": [span for _, *span in left_out], "lag_s": lag_s, "offset_s": offset_s}
         said |= {"wrong_numbers": int(wrong.sum())}
         said |= {"presses": fit.presses, "gain_std": stds.reshape(kneading.shape).tolist()}
         print(json.dumps(said | calibration.nominal_wire_ohm._asdict()))  # noqa: T201
@@ -345,8 +347,9 @@ def _knead(
     lag = f"the scale lags by {1000 * lag_s:.0f} ms"
     fewer = f"{_presses(fit.presses_left_out)} left out"
     TERMINAL.print(f"{_presses(fit.presses)}; {lag}; {fewer}")
-    for begin_s, end_s in left_out:
-        TERMINAL.print(f"left out: {begin_s:.1f} to {end_s:.1f} s, force beside the skin?")
+    for name, begin_s, end_s in left_out:
+        span = f"{name}, {begin_s:.1f} to {end_s:.1f} s"
+        TERMINAL.print(f"left out: {span}, force beside the skin?")
     if wrong.any():
         text = f"numbers of the scale left out, far from those around them: {wrong.sum()}"
         TERMINAL.print(text)

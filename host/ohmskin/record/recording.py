@@ -40,6 +40,7 @@ import zlib
 from array import array
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, BinaryIO, Final, Self, TypeVar
 
 import lz4.frame
@@ -217,6 +218,7 @@ class Recording:
     hellos: at least one.
     scans, tares, marks, forces: any number of each.
     cut_off: whether the recording was not ended properly, so that its last second may be missing.
+    name: of its file.
     """
 
     hellos: list[Hello]
@@ -225,6 +227,7 @@ class Recording:
     marks: list[Mark]
     forces: list[ForceSample]
     cut_off: bool
+    name: str = ""
 
 
 def load_recording(path: PathName) -> Recording:
@@ -238,7 +241,8 @@ def load_recording(path: PathName) -> Recording:
         return [message for message in in_order if isinstance(message, kind)]
 
     cut_off = in_order[-1] is not None
-    return Recording(of(Hello), of(Scan), of(Tare), of(Mark), of(ForceSample), cut_off)
+    kinds = of(Hello), of(Scan), of(Tare), of(Mark), of(ForceSample)
+    return Recording(*kinds, cut_off, Path(path).name)
 
 
 def messages(
