@@ -84,6 +84,26 @@ def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
     assert load_calibration(out).model.slope_std.max() < first.model.slope_std.max()
 
 
+def test_a_touch_at_the_rest_of_an_older_recording_is_named(run: Run, tmp_path: Path) -> None:
+    """The newest rest alone was looked at, and the older recording taught what it could not."""
+    out, path = tmp_path / "skin.json", tmp_path / "skin.knead-1.mcap"
+    command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3", str(out), *TRUTH)
+    well(run(*command, "--seconds", "11"))
+    given = load_recording(path)
+    pressed_s = max(given.forces, key=lambda force: force.force_n).host_time_s
+    pressed = next(scan for scan in given.scans if scan.host_time_s >= pressed_s)
+    path.unlink()
+    with Recorder(path, given.hellos[0]) as recorder:
+        recorder.add(replace(given.tares[0], rest_ratio=pressed.ratio))
+        for message in [*given.scans, *given.forces]:
+            recorder.add(message)
+    before = out.read_bytes()
+    done = run(*command, "--seconds", "11")
+    assert_one_line(done._replace(out=""), "skin.knead-1.mcap: ", "touched at rest: move it away")
+    assert out.read_bytes() == before
+    well(run(*command, "--seconds", "3", "--force"))
+
+
 def test_a_press_that_is_left_out_is_named_by_its_recording(run: Run, tmp_path: Path) -> None:
     """Its time was that since the first recording began, with pauses that were made up."""
     out = tmp_path / "skin.json"

@@ -44,6 +44,7 @@ from ohmskin.cli.weights import (
     guided,
     put_anywhere,
 )
+from ohmskin.errors import TareRefused
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
@@ -296,7 +297,12 @@ def knead(
 def _learn_totals(calibrator_of: _CalibratorOf, recordings: list[Recording], out: Path) -> None:
     """Write the calibration that the forces on the whole skin teach."""
     usable = joined(recordings)
-    calibrator = calibrator_of(usable[-1].hellos[-1], _rest_ratio(usable[-1], 0.0))
+    for given in usable:  # each rest is checked, and the last one is that of the calibration
+        try:
+            calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, 0.0))
+        except TareRefused as exc:
+            remedy = "move it away, or say --force if nothing was on the skin"
+            raise TareRefused(f"{given.name}: {exc.problem}", remedy) from exc
     _knead(calibrator, usable, None, out, as_json=False)
 
 
