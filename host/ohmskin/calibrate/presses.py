@@ -293,8 +293,7 @@ class Calibrator:
         """
         if self.shows_wires:
             return self.measure(scans, progress)
-        estimator = make_estimator(WIRELESS, self.knowledge)
-        return self._history(estimator, estimator.rest_level(), progress(scans))
+        return self._history(make_estimator(WIRELESS, self.knowledge), progress(scans))
 
     def measure(self, scans: list[Scan], progress: Progress = iter) -> LevelHistory:
         """What all scans show above rest. progress: as for `look`.
@@ -302,9 +301,10 @@ class Calibrator:
         Raises ValueError for scans of another size than the untouched skin, and TareRefused where
         it was touched.
         """
-        return self._history(self.estimator, self.rest_level, progress(scans))
+        return self._history(self.estimator, progress(scans))
 
-    def _history(self, estimator: Estimator, rest: Float, scans: Iterable[Scan]) -> LevelHistory:
+    def _history(self, estimator: Estimator, scans: Iterable[Scan]) -> LevelHistory:
+        rest = estimator.rest_level()
         levels, read = [], []
         for scan in scans:
             answer = estimator.estimate(scan.ratio)
