@@ -209,9 +209,12 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     lines = np.exp(p[:2]) * std[:2] * (knowledge.columns, knowledge.rows)
     unclear = (std[:2] > UNCLEAR_LOG) & (lines > 1 / HIGHEST_TOUCH_SIEMENS)
     layers = tuple(np.array(["top", "bottom"])[unclear].tolist())
-    return FoundWires(
-        fit.wires(p, std), knowledge.nominal_wire_ohm, np.unique(readings.press).size, layers
-    )
+    top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
+    lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
+    top_std, bottom_std = std[:2].tolist()
+    wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std_ohm)
+    presses = np.unique(readings.press).size
+    return FoundWires(wires, knowledge.nominal_wire_ohm, presses, layers)
 
 
 def _rows(readings: PressReadings, rest_current: Float) -> _Rows:
@@ -428,15 +431,6 @@ class _PressFit:
         start = np.log(scatter / SCATTER) / SCATTER_LOG_STD
         found = minimize(score, start, method="L-BFGS-B", bounds=[(-5.0, 5.0)] * start.size)
         return SCATTER * np.exp(SCATTER_LOG_STD * found.x), float(found.fun)
-
-    # ----------------------------------------------------------------------------- the answer
-
-    def wires(self, p: Float, std: Float) -> WireOhm:
-        """The wires of this p and its deviations (7,), with those that are stated."""
-        top_log_std, bottom_log_std = std[:2].tolist()
-        lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
-        top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
-        return WireOhm(top_ohm, bottom_ohm, lead_ohm, top_log_std, bottom_log_std, lead_std_ohm)
 
 
 class _Whitener:
