@@ -119,7 +119,7 @@ class MeasuredWires(WireBelief):
         log_cells: the cells that the fit starts from are good enough, because c and q need only an
             approximate model of the frame.
         """
-        self._measure(self.circuit(log_cells, self.means), ports)
+        self._measure(self.circuit(log_cells, self.means, PortCircuit), ports)
 
     def _measure(self, circuit: PortCircuit, ports: PortReadings) -> tuple[float, float]:
         """The means of one frame, from an approximate circuit of it; o and the variance of o."""
@@ -241,7 +241,7 @@ class MeasuredWires(WireBelief):
         if not self._is_news(fit.log_cells):
             return False
         self._lesson_cells = fit.log_cells
-        circuit = self.circuit(fit.log_cells, self.means)
+        circuit = self.circuit(fit.log_cells, self.means, PortCircuit)
         offset = self._measure(circuit, ports)
         if self.fault:
             return False

@@ -42,6 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
@@ -117,7 +118,7 @@ class FullFit:
     def _evaluate(self) -> None:
         """The circuit at the present state."""
         self._means = self._belief.means_off(self._mean_stds)
-        self._circuit = self._belief.circuit(self.log_cells, self._means)
+        self._circuit = self._belief.circuit(self.log_cells, self._means, PortCircuit)
         series_ohm = self._ref_ohm + self._belief.lead_count * self._means[2]
         # A step may make the mean lead negative. Half of the references is far below what any port
         # has in series, and keeps the current finite.
@@ -379,7 +380,7 @@ class FullFit:
         look like leaks.
         """
         alike = np.full_like(self.log_cells, self.log_cells.mean())
-        circuit = self._belief.circuit(alike, self._means)
+        circuit = self._belief.circuit(alike, self._means, PortCircuit)
         by_leaks = self._weighted(1e-6 * circuit.by_leaks())
         return self._cells_by(by_leaks, self._weighted(circuit.by_cell()))
 

@@ -26,7 +26,7 @@ from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.port_partial import STALE_SHARE
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import LEFT_OUT_STDS, MAX_CHI2, MAX_STEP_LOG, CellPrior
-from ohmskin.estimate.sparse_fit import Cells, RestNetwork, Touched
+from ohmskin.estimate.sparse_fit import NO_CELLS, Cells, RestNetwork, Touched, TouchedNetwork
 from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, WireBelief
 
 # Most steps of a frame; one that needs more is fitted as a whole. Chosen: a frame begins at the
@@ -49,10 +49,8 @@ class WholeFrame:
         self.wires_log_std, self.leads_log_std = answer.wires_log_std, answer.leads_log_std
         self.misfit, self.surprise = answer.misfit, answer.surprise
         self.series_ohm = ref_ohm + belief.lead_count * belief.means[2]
-        siemens = np.exp(-answer.log_cells).reshape(belief.shape)
-        leak_siemens = belief.leak_siemens(belief.means)
-        wires_ohm = np.exp(belief.means[:2])
-        self.net = RestNetwork(siemens, *wires_ohm, far=belief.far, leak_siemens=leak_siemens)
+        self.net = belief.circuit(answer.log_cells, belief.means, RestNetwork)
+        self.untouched = TouchedNetwork(self.net, NO_CELLS, np.zeros(0))
 
 
 class RegionFit:
@@ -77,7 +75,7 @@ class RegionFit:
     surprise: float
 
     def __init__(self, whole: WholeFrame, region: Cells, age: int = 0) -> None:
-        self.region, self._whole, net, belief = region, whole, whole.net, whole.belief
+        self.region, self._whole, net = region, whole, whole.net
         self.misfit, self.surprise = whole.misfit, whole.surprise
         self._x = -whole.log_cells[region]
         self._before = net.cell_siemens[region]
@@ -86,17 +84,11 @@ class RegionFit:
         self._rho = net.port_ohm[region]
         self._eye = np.eye(region.size)
         self._right = np.empty((region.size, region.size + 1), order="F")
-        currents = (net.port_volt[:, region] * net.cell_siemens[:, None]).T
+        by_cell, by_wires = whole.untouched.slopes(region, whole.prior, whole.belief, region)
         square = ((self._rho + whole.series_ohm) ** -2.0)[:, None]
-        by_cell = currents * currents / net.cell_siemens * square
-        by_cell[:, region] = 0.0
-        of_cells = by_cell @ whole.prior.by_means
-        if belief.has_leaks:
-            of_cells[:, 3:] += 1e-6 * square * net.by_leaks()[region]  # by uS
-        by_wire = square * net.by_wires_of(region, currents, currents)
-        self._by_wires = belief.per_std(by_wire, square * belief.leads_of_ports[region], of_cells)
-        # S, but for the readings.
-        self._model_covariance = gram(np.hstack([self._by_wires, by_cell * whole.log_cells_std]))
+        self._by_wires = square * by_wires
+        by_cell *= square * whole.log_cells_std
+        self._model_covariance = gram(np.hstack([self._by_wires, by_cell]))  # S, but for readings
         self.age = age
 
     def fit(self, ports: PortReadings) -> bool:

@@ -46,7 +46,7 @@ by S^-1 there.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,22 +96,13 @@ class RestNetwork(PortCircuit):
     own_slope: -d rho / d g of each cell at its own port, (RC,) [ohm^2].
     """
 
-    def __init__(
-        self,
-        cell_siemens: Float,
-        top_wire_ohm: float,
-        bottom_wire_ohm: float,
-        *,
-        far: tuple[bool, bool] = (False, False),
-        leak_siemens: tuple[float, float] = (0.0, 0.0),
-    ) -> None:
-        super().__init__(
-            cell_siemens, top_wire_ohm, bottom_wire_ohm, far=far, leak_siemens=leak_siemens
-        )
+    def __init__(self, cell_siemens: Float, *wire_ohm: float, **others: Any) -> None:
+        """Made of what a `PortCircuit` is made of."""
+        super().__init__(cell_siemens, *wire_ohm, **others)
         self.cell_siemens = siemens = cell_siemens.ravel()
         lines = self.cell_current.reshape(-1, siemens.size) / siemens
         self.port_volt = self.sense_volt = port_difference(lines, self.rows).T
-        if any(far):
+        if any(self.far):
             sensed = self.sense_current.reshape(-1, siemens.size) / siemens
             self.sense_volt = port_difference(sensed, self.rows).T
         # in_series[e, f]: current through cell e per volt inserted in series with cell f. While the
@@ -182,6 +173,24 @@ class TouchedNetwork:
             sense_volt = rest.sense_volt[cells, cells] - (coupling * sense_drawn).sum(axis=0)
         cell_volt = rest.cell_volt[cells, cells] - (coupling * by_forced).sum(axis=0)
         return volt * sense_volt, cell_volt
+
+    def slopes(
+        self, ports: Cells, prior: CellPrior, belief: WireBelief, fitted: Cells | None = None
+    ) -> tuple[Float, Float]:
+        """Slopes of rho of m ports by the log resistances of cells (m, RC), and by wires.
+
+        Those by cells that are fitted are 0; by default, these are the touched ones. The others
+        follow the means of the wires. Slopes by wires are those of `WireBelief.per_std`. By
+        Tellegen, the slope by a cell is v v' g, v' by the sensed ends, and likewise by a wire.
+        """
+        current, sensed = self.cell_current(ports)
+        by_cell = current * sensed / self._rest.cell_siemens
+        by_cell[:, self._cells if fitted is None else fitted] = 0.0
+        of_cells = by_cell @ prior.by_means
+        if belief.has_leaks:
+            of_cells[:, 3:] += 1e-6 * self.by_leaks(ports)  # by uS
+        by_wire = self._rest.by_wires_of(ports, current, sensed)
+        return by_cell, belief.per_std(by_wire, belief.leads_of_ports[ports], of_cells)
 
     def by_leaks(self, ports: Cells) -> Float:
         """Slopes of rho of m ports by the leaks of rows, and of columns, (m, 2) [ohm / S].
@@ -276,30 +285,13 @@ class SparseFit:
         self.series_ohm = ref_ohm + belief.lead_count * prior.means[2]
         self.most = most_touches(belief.shape)
         self.least_log_siemens = -prior.expected + TOUCHED_STDS * prior.std
-        rest_siemens = np.exp(-prior.expected).reshape(belief.shape)
-        self.net = net = RestNetwork(
-            rest_siemens,
-            *np.exp(prior.means[:2]),
-            far=belief.far,
-            leak_siemens=belief.leak_siemens(prior.means),
-        )
+        self.net = net = belief.circuit(prior.expected, prior.means, RestNetwork)
         self.untouched = TouchedNetwork(net, NO_CELLS, np.zeros(0))
         self.current = 1.0 / (net.port_ohm + self.series_ohm)
-        siemens = net.cell_siemens[:, None]
-        # The slope of I by the log of a resistance is I^2 times the slope of rho, but for the sign.
-        # The slope of rho is v v' g for a cell, v' by the sensed ends, and likewise for a wire
-        # (Tellegen).
-        by_cell = self.current**2 * net.port_volt * net.sense_volt * siemens
-        currents = (net.port_volt * siemens).T, (net.sense_volt * siemens).T
-        by_wire = net.by_wires_of(np.arange(siemens.size), *currents)
-        by_ohm = (self.current**2)[:, None]
-        by_lead = by_ohm * belief.leads_of_ports
-        of_cells = by_cell.T @ prior.by_means
-        if belief.has_leaks:
-            of_cells[:, 3:] += 1e-6 * by_ohm * net.by_leaks()  # by uS
-        per_std = belief.per_std(by_wire * by_ohm, by_lead, of_cells)
-        self.model_variance = prior.std**2 @ (by_cell * by_cell)
-        self.model_variance += np.einsum("ij,ij->i", per_std, per_std)
+        by_cell, by_wire = self.untouched.slopes(np.arange(net.port_ohm.size), prior, belief)
+        # The slope of I is that of rho times I^2, but for the sign.
+        variance_ohm2 = by_cell**2 @ prior.std**2 + (by_wire**2).sum(axis=1)
+        self.model_variance = variance_ohm2 * self.current**4
         path_ohm = belief.believed_wires().path_ohm
         self.least_ohm = path_ohm - (self.series_ohm - ref_ohm)
         *layer_std, lead_std_ohm = belief.means_std()[:3].tolist()
@@ -545,20 +537,12 @@ class FewTouches:
         At these ports, s has the noise of the readings and the drift of cells at rest as the
         touched network shows it. It no longer has the wires, because these are in S.
         """
-        skin, net = self._skin, self._skin.net
-        currents, sensed = self._touched.cell_current(ports)
-        square = self._current[ports] ** 2
-        by_cell = currents * sensed / net.cell_siemens
-        by_cell[:, self.cells] = 0.0
-        by_mean = by_cell @ skin.prior.by_means
-        if skin.belief.has_leaks:
-            by_mean[:, 3:] += 1e-6 * self._touched.by_leaks(ports)  # by uS
+        skin, square = self._skin, self._current[ports] ** 2
+        by_cell, by_wire = self._touched.slopes(ports, skin.prior, skin.belief)
         by_cell *= skin.prior.std
         model_variance = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
         std = self._std.copy()
         std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
         std[self.cells] = self._reading_std[self.cells]
-        by_wire = net.by_wires_of(ports, currents, sensed)
-        by_rho = -(square / std[ports])[:, None]
-        by_lead = by_rho * skin.belief.leads_of_ports[ports]
-        return std, skin.belief.per_std(by_rho * by_wire, by_lead, by_rho * by_mean)
+        by_wire *= -(square / std[ports])[:, None]
+        return std, by_wire

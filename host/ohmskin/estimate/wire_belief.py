@@ -82,7 +82,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -116,6 +116,8 @@ MOST_FITS: Final = 4
 # A leak of a fit may be this far below 0 [uS]. No leak is, but a limit at 0, of which slopes do not
 # know, would keep fits of small leaks from ending. Chosen: as much as 10 MOhm, the other way.
 LOWEST_LEAK_US: Final = -0.1
+
+CircuitT = TypeVar("CircuitT", bound=PortCircuit)
 
 
 class Lesson(NamedTuple):
@@ -308,12 +310,10 @@ class WireBelief(ABC):
         lead = max(float(means[2]), 0.0)
         return WireOhm(top, bottom, lead, *np.sqrt(variance[:3]).tolist())
 
-    def circuit(self, log_cells: Float, means: Float) -> PortCircuit:
+    def circuit(self, log_cells: Float, means: Float, kind: type[CircuitT]) -> CircuitT:
         """The skin with these logs of its cells (RC,), and these means (n,), without its leads."""
-        cell_siemens = np.exp(-log_cells).reshape(self.shape)
-        return PortCircuit(
-            cell_siemens, *np.exp(means[:2]), far=self.far, leak_siemens=self.leak_siemens(means)
-        )
+        siemens, leaks = np.exp(-log_cells).reshape(self.shape), self.leak_siemens(means)
+        return kind(siemens, *np.exp(means[:2]), far=self.far, leak_siemens=leaks)
 
     def leak_siemens(self, means: Float) -> tuple[float, float]:
         """From row to row, and from column to column, at each crossing, by these means (n,) [S]."""
