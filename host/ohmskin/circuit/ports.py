@@ -205,18 +205,8 @@ class PortCircuit:
         return self._slopes(self._wire_current, self._wire_sense_current, ohm)
 
     def by_layers(self) -> Float:
-        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm].
-
-        They are the sums of `by_wires` over each layer. Here a product of the currents of lines
-        gives them without the slopes by single segments, which takes less time.
-        """
-        slopes, lines = [], len(self.impedance)
-        for layer, ohm in enumerate(self.wire_ohm):
-            current = self._wire_current[:, layer].reshape(lines, -1)
-            sensed = self._wire_sense_current[:, layer].reshape(lines, -1)
-            row, column = _ends_of_ports((current * np.ravel(ohm)) @ sensed.T, self.rows)
-            slopes.append((row - column).ravel())
-        return np.transpose(slopes)
+        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm]."""
+        return np.asarray(self.by_wires().reshape(self.port_ohm.size, 2, -1).sum(axis=2))
 
     def by_leaks(self) -> Float:
         """Slopes by the leaks of rows, and of columns, (RC, 2) [ohm / S]."""
