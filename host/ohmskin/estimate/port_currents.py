@@ -52,6 +52,7 @@ move a and b alike, but neither moves I. So a and b are not taken as they are re
 current gives them: 1 - R_top I and R_bottom I.
 """
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -189,37 +190,36 @@ class FarReadings(NamedTuple):
     is_dead: Bool
 
 
-class FarEnds:
-    """Reads the far ends of rows, of columns, or of both. sensed: which of the two have any."""
+def far_ends_of(names: Sequence[str]) -> tuple[bool, bool]:
+    """Whether readings of these names are taken at far ends of rows, and of columns."""
+    row, column = (node in names or EXCHANGED[node] in names for node in "ef")
+    return row, column
 
-    def __init__(self, knowledge: SkinKnowledge) -> None:
-        self._names = names = knowledge.checked_names
-        row, column = (node in names or EXCHANGED[node] in names for node in "ef")
-        self.sensed = row, column
-        self._ref_ohm = (knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
-        self._least_current = knowledge.current_std
 
-    def read(self, ratio: Float, near: PortCurrents, variance: Float) -> FarReadings:
-        """What the far ends of checked readings show; near: the currents of the same frame.
+def read_far_ends(
+    ratio: Float, knowledge: SkinKnowledge, near: PortCurrents, variance: Float
+) -> FarReadings:
+    """What the far ends of checked readings show; near: the currents of the same frame.
 
-        variance (R, C): of the difference between both ends of a line [V^2/Vdd^2]. A side that is
-        not sensed at far ends takes the near end: no wires, as far as they are concerned.
-        """
-        current = np.maximum(near.current, self._least_current)
-        near_end = 1.0 - self._ref_ohm[0] * current, self._ref_ohm[1] * current  # a, b
-        row_end, column_end = (
-            node_ratio(ratio, self._names, node) if is_sensed else potential
-            for node, is_sensed, potential in zip("ef", self.sensed, near_end, strict=True)
-        )
-        # Behind long wires, other cells may carry more to the far ends than the port's own: U < 0.
-        apart = np.maximum(row_end - column_end, LEAST_APART * sum(self._ref_ohm) * current)  # U
-        whole = apart + sum(self._ref_ohm) * current
-        # By d u / d I = U / (U + R_s I)^2 and d u / d U = - I / (U + R_s I)^2.
-        std = np.sqrt(apart**2 * near.std**2 + variance * current**2) / whole**2
-        drop = np.stack([near_end[0] - row_end, column_end - near_end[1]])
-        ends = np.stack([row_end, column_end])
-        is_dead = near.current < DEAD_STDS * near.std
-        a, b = (node_ratio(ratio, self._names, node) for node in "ab")
-        read_drop = np.stack([a - row_end, column_end - b])
-        ports = PortCurrents(current / whole, std)
-        return FarReadings(ports, current, drop, read_drop, ends, is_dead)
+    variance (R, C): of the difference between both ends of a line [V^2/Vdd^2]. A side that is not
+    sensed at far ends takes the near end: no wires, as far as they are concerned.
+    """
+    names, ref_ohm = knowledge.checked_names, knowledge.ref_ohm
+    current = np.maximum(near.current, knowledge.current_std)
+    near_end = 1.0 - knowledge.ref_top_ohm * current, knowledge.ref_bottom_ohm * current  # a, b
+    ends = row_end, column_end = np.stack(
+        [
+            node_ratio(ratio, names, node) if is_sensed else potential
+            for node, is_sensed, potential in zip("ef", far_ends_of(names), near_end, strict=True)
+        ]
+    )
+    # Behind long wires, other cells may carry more to the far ends than the port's own: U < 0.
+    apart = np.maximum(row_end - column_end, LEAST_APART * ref_ohm * current)  # U
+    whole = apart + ref_ohm * current
+    # By d u / d I = U / (U + R_s I)^2 and d u / d U = - I / (U + R_s I)^2.
+    std = np.sqrt(apart**2 * near.std**2 + variance * current**2) / whole**2
+    drop = np.stack([near_end[0] - row_end, column_end - near_end[1]])
+    a, b = (node_ratio(ratio, names, node) for node in "ab")
+    read_drop = np.stack([a - row_end, column_end - b])
+    ports, is_dead = PortCurrents(current / whole, std), near.current < DEAD_STDS * near.std
+    return FarReadings(ports, current, drop, read_drop, ends, is_dead)

@@ -98,46 +98,38 @@ _TO_NEAR: Final = np.array([1.0, -1.0]).reshape(2, 1, 1)
 _LINES: Final = ("row", "column")  # By axis: rows are counted by axis 0 of an array of ports.
 
 
-class Contradictions:
-    """Checks whether the readings of a cell agree, and leaves out one that is stuck."""
+def mended(
+    near_ends: NearEnds, near: NearReadings, spread: Spread, ports: PortCurrents, ratio_std: float
+) -> tuple[PortCurrents, str]:
+    """The currents without stuck readings; and what could not be mended, in words, or empty.
 
-    def __init__(self, near_ends: NearEnds, ratio_std: float) -> None:
-        self._near_ends, self._ratio_std = near_ends, ratio_std
-        self._has_four = near_ends.per_cell == 4
-        # The multiplexers at far ends double the capacitance that charges.
-        charging = 1.0 if self._has_four else 2.0
-        self._most_cells, self._one_cell = charging * MOST_CELLS_RATIO, charging * ONE_CELL_RATIO
-
-    def mended(
-        self, near: NearReadings, spread: Spread, ports: PortCurrents
-    ) -> tuple[PortCurrents, str]:
-        """The currents without stuck readings; and what could not be mended, in words, or empty.
-
-        ports: the currents of these readings. Their arrays are not written into.
-        """
-        typical = spread.median_rms
-        if typical > self._most_cells:
-            return ports, f"the readings of most cells disagree, by {100 * typical:.0f} % of Vdd"
-        limit = max(self._one_cell, ONE_CELL_TIMES * typical)
-        if spread.rms.max() <= limit:  # as in most frames
-            return ports, ""
-        current, std, fault = ports.current.copy(), ports.std.copy(), ""
-        agree = max(AGREE_STDS * self._ratio_std, ONE_CELL_TIMES * typical)
-        for index in np.flatnonzero(spread.rms > limit):
-            cell = np.unravel_index(index, spread.rms.shape)
-            if self._has_four:
-                disagreement, current_of_three = self._near_ends.best_three(near.ratio[cell])
-                if disagreement < agree:
-                    current[cell] = current_of_three
-                    # The cell's own deviation comes from the stuck reading, too, so that of the
-                    # best cell is taken. Chosen: twice that, because in three readings offsets and
-                    # what lines draw do not cancel.
-                    std[cell] = 2.0 * std.min()
-                    continue
+    ports: the currents of these readings. Their arrays are not written into.
+    ratio_std: deviation of a reading by its rounding [V/Vdd].
+    """
+    has_four, typical = near_ends.per_cell == 4, spread.median_rms
+    charging = 1.0 if has_four else 2.0  # multiplexers at far ends double the capacitance
+    if typical > charging * MOST_CELLS_RATIO:
+        return ports, f"the readings of most cells disagree, by {100 * typical:.0f} % of Vdd"
+    limit = max(charging * ONE_CELL_RATIO, ONE_CELL_TIMES * typical)
+    if spread.rms.max() <= limit:  # as in most frames
+        return ports, ""
+    current, std, fault = ports.current.copy(), ports.std.copy(), ""
+    agree = max(AGREE_STDS * ratio_std, ONE_CELL_TIMES * typical)
+    for index in np.flatnonzero(spread.rms > limit):
+        cell = np.unravel_index(index, spread.rms.shape)
+        disagreement, current_of_three = np.inf, 0.0
+        if has_four:
+            disagreement, current_of_three = near_ends.best_three(near.ratio[cell])
+        if disagreement < agree:
+            current[cell] = current_of_three
+            # The cell's own deviation comes from the stuck reading, too, so that of the best cell
+            # is taken. Chosen: twice that, because in three readings offsets and what lines draw
+            # do not cancel.
+            std[cell] = 2.0 * std.min()
+        else:  # one is enough for a message: the last
             by = 100 * spread.rms[cell]
-            # One is enough for a message: the last.
             fault = f"{cell_of(index, current)}: its readings disagree by {by:.0f} % of Vdd"
-        return PortCurrents(current, std), fault
+    return PortCurrents(current, std), fault
 
 
 class LinePairs:

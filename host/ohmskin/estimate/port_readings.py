@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.estimate.port_currents import FarEnds, NearEnds, PortCurrents
-from ohmskin.estimate.port_faults import Contradictions, FarFaults, SkinFaults
+from ohmskin.estimate.port_currents import NearEnds, PortCurrents, far_ends_of, read_far_ends
+from ohmskin.estimate.port_faults import FarFaults, SkinFaults, mended
 from ohmskin.estimate.port_noise import ReadingNoise, Spread, Variances
 from ohmskin.estimate.port_partial import PartialEnds, Shown
 
@@ -81,11 +81,10 @@ class PortReader:
     """
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
-        self._near_ends, self._far_ends = NearEnds(knowledge), FarEnds(knowledge)
-        self.far = self._far_ends.sensed
+        self._knowledge, self._near_ends = knowledge, NearEnds(knowledge)
+        self.far = far_ends_of(knowledge.checked_names)
         per_cell, square_ohm = self._near_ends.per_cell, self._near_ends.square_ohm
         self._noise = ReadingNoise(knowledge, per_cell, square_ohm)
-        self._contradictions = Contradictions(self._near_ends, knowledge.ratio_std)
         self._partial = PartialEnds(knowledge)
         rest = None
         if knowledge.rest_ratio is not None:
@@ -121,7 +120,7 @@ class PortReader:
         assert near.variances is not None  # at far ends, all is read
         assert near.spread is not None
         variance = self._noise.between_ends(near.variances)
-        far = self._far_ends.read(ratio, near.ports, variance)
+        far = read_far_ends(ratio, self._knowledge, near.ports, variance)
         drop_ratio_std = np.sqrt(variance)
         shift_ratio = self._noise.offset_std(near.spread, near.offset_ratio)
         find = self._far_faults.find if in_order else self._far_faults.keep_as_rest
@@ -158,7 +157,8 @@ class PortReader:
         if in_order:
             noise.keep(near.residual)
         ports = PortCurrents(current, noise.current_std(variances))
-        ports, fault = self._contradictions.mended(near, spread, ports)
+        ratio_std = self._knowledge.ratio_std
+        ports, fault = mended(self._near_ends, near, spread, ports, ratio_std)
         if not any(self.far):
             self._partial.keep(Shown(ports, near.offset_ratio, variances.noise))
         # In mode far, both near ends have the same offset. Mode near does not use it.

@@ -360,19 +360,15 @@ class WireBelief(ABC):
     def stds(self) -> WireStds:
         """How well the means are known: made once for each belief."""
         if self._state.stds is None:
-            self._state.stds = self._find_stds()
+            layer_stds, lead_std_ohm = self.means_std()[:2], float(self.means_std()[2])
+            wary_stds = np.maximum(self._wary_layer_stds(), layer_stds)
+            self._state.stds = WireStds(
+                float(wary_stds.max()),
+                float((wary_stds / layer_stds).max()),
+                self._known_lead_std_ohm / lead_std_ohm,
+                UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS,
+            )
         return self._state.stds
-
-    def _find_stds(self) -> WireStds:
-        """`stds`, of the present state."""
-        layer_stds, lead_std_ohm = self.means_std()[:2], float(self.means_std()[2])
-        wary_stds = np.maximum(self._wary_layer_stds(), layer_stds)
-        return WireStds(
-            float(wary_stds.max()),
-            float((wary_stds / layer_stds).max()),
-            self._known_lead_std_ohm / lead_std_ohm,
-            UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS,
-        )
 
     def _wary_layer_stds(self) -> Float:
         """Deviations of both layers (2,), for wires that may have changed since the last frame."""
