@@ -92,6 +92,7 @@ class RestNetwork(PortCircuit):
 
     cell_siemens: conductances of the cells, (RC,) [S]; given as (R, C).
     port_volt, sense_volt: H by the driven and by the sensed ends of the ports, (cells, ports).
+    volts: both of them; where all ends are near ends, these are one.
     cell_volt: M, (RC, RC).
     own_slope: -d rho / d g of each cell at its own port, (RC,) [ohm^2].
     """
@@ -100,18 +101,17 @@ class RestNetwork(PortCircuit):
         """Made of what a `PortCircuit` is made of."""
         super().__init__(cell_siemens, *wire_ohm, **others)
         self.cell_siemens = siemens = cell_siemens.ravel()
-        lines = self.cell_current.reshape(-1, siemens.size) / siemens
-        self.port_volt = self.sense_volt = port_difference(lines, self.rows).T
-        if any(self.far):
-            sensed = self.sense_current.reshape(-1, siemens.size) / siemens
-            self.sense_volt = port_difference(sensed, self.rows).T
+        currents = [self.cell_current, self.sense_current][: 1 + any(self.far)]
+        lines = [current.reshape(-1, siemens.size) / siemens for current in currents]
+        self.volts = [port_difference(each, self.rows).T for each in lines]
+        self.port_volt, self.sense_volt = self.volts[0], self.volts[-1]
         # in_series[e, f]: current through cell e per volt inserted in series with cell f. While the
         # electrodes are held, it is B = sqrt(g) (1 + sqrt(g) K sqrt(g))^-1 sqrt(g). As they float,
-        # it is B - B E^T Z E B, where B E^T is `per_potential`, and Z E B is `lines * siemens`.
+        # it is B - B E^T Z E B, where B E^T is `per_potential`, and Z E B is `lines[0] * siemens`.
         # (K, E and Z as in `circuit.skin`.)
         in_series = inverse(self.factor)
         in_series *= np.sqrt(siemens) * np.sqrt(siemens)[:, None]
-        in_series -= self.per_potential @ (lines * siemens)
+        in_series -= self.per_potential @ (lines[0] * siemens)
         # One ampere forced through cell f makes 1 / g_f volts over it, if no current can leave the
         # cell. As it can, the cell acts as a source of 1 / g_f volts (Norton), which drives
         # in_series[:, f] / g_f through all cells, against the voltages that are counted here.
@@ -148,16 +148,13 @@ class TouchedNetwork:
 
     def __init__(self, rest: RestNetwork, cells: Cells, added: Float) -> None:
         self._rest, self._cells, self._added = rest, cells, added
-        port_volt, sense_volt = rest.port_volt[cells], rest.sense_volt[cells]
         self._system = rest.cell_volt[cells[:, None], cells]
         self._system.ravel()[:: cells.size + 1] += 1.0 / added
-        self._drawn = solve_positive(self._system, port_volt)
-        self._sense_drawn, self.volt = self._drawn, self._drawn / added[:, None]
-        self.sense_volt = self.volt
-        if any(rest.far):
-            self._sense_drawn = solve_positive(self._system, sense_volt)
-            self.sense_volt = self._sense_drawn / added[:, None]
-        self.port_ohm = rest.port_ohm - (sense_volt * self._drawn).sum(axis=0)
+        # q by the driven ends, and by the sensed ones if they are others.
+        self._drawn = [solve_positive(self._system, volt[cells]) for volt in rest.volts]
+        volts = [drawn / added[:, None] for drawn in self._drawn]
+        self.volt, self.sense_volt = volts[0], volts[-1]
+        self.port_ohm = rest.port_ohm - (rest.sense_volt[cells] * self._drawn[0]).sum(axis=0)
 
     def own_slope(self, cells: Cells) -> tuple[Float, Float]:
         """-d rho / d g of some cells, each at its own port, and their M[e, e], cells touched."""
@@ -166,13 +163,12 @@ class TouchedNetwork:
             return rest.own_slope[cells], rest.cell_volt[cells, cells]
         coupling = rest.cell_volt[self._cells[:, None], cells]
         by_forced = solve_positive(self._system, coupling)  # q, of currents forced through cells
-        volt = rest.port_volt[cells, cells] - (coupling * self._drawn[:, cells]).sum(axis=0)
-        sense_volt = volt
-        if any(rest.far):
-            sense_drawn = self._sense_drawn[:, cells]
-            sense_volt = rest.sense_volt[cells, cells] - (coupling * sense_drawn).sum(axis=0)
+        volts = [
+            volt[cells, cells] - (coupling * drawn[:, cells]).sum(axis=0)
+            for volt, drawn in zip(rest.volts, self._drawn, strict=True)
+        ]
         cell_volt = rest.cell_volt[cells, cells] - (coupling * by_forced).sum(axis=0)
-        return volt * sense_volt, cell_volt
+        return volts[0] * volts[-1], cell_volt
 
     def slopes(
         self, ports: Cells, prior: CellPrior, belief: WireBelief, fitted: Cells | None = None
@@ -203,8 +199,8 @@ class TouchedNetwork:
         volt, sensed = (
             port_difference(potential, rows)[ports] - drawn.T[ports] @ by_touch
             for potential, drawn in (
-                (rest.impedance.T, self._drawn),
-                (rest.sensed.T, self._sense_drawn),
+                (rest.impedance.T, self._drawn[0]),
+                (rest.sensed.T, self._drawn[-1]),
             )
         )
         return leak_slopes(volt, sensed, rest.shape)
@@ -217,13 +213,11 @@ class TouchedNetwork:
         rest, cell_volt_of_touched = self._rest, self._rest.cell_volt[self._cells]
         siemens = rest.cell_siemens.copy()
         siemens[self._cells] += self._added
-        current: Float = rest.port_volt.T[ports]
-        current -= self._drawn.T[ports] @ cell_volt_of_touched
-        current *= siemens
-        if not any(rest.far):
-            return current, current
-        sensed = rest.sense_volt.T[ports] - self._sense_drawn.T[ports] @ cell_volt_of_touched
-        return current, sensed * siemens
+        currents = [
+            (volt.T[ports] - drawn.T[ports] @ cell_volt_of_touched) * siemens
+            for volt, drawn in zip(rest.volts, self._drawn, strict=True)
+        ]
+        return currents[0], currents[-1]
 
 
 @dataclass(frozen=True, eq=False)
