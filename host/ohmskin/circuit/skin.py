@@ -105,7 +105,7 @@ class Skin:
 
 
 @lru_cache(maxsize=8)
-def _incidence(rows: int, columns: int) -> Float:
+def incidence(rows: int, columns: int) -> Float:
     """E^T, (RC, R+C): a cell's voltage is the potential of its row less that of its column."""
     by_row = np.kron(np.eye(rows), np.ones((columns, 1)))
     return np.hstack([by_row, -np.tile(np.eye(columns), (rows, 1))])
@@ -146,7 +146,7 @@ def factorised(
     system *= root.reshape(-1, 1)
     system *= root.reshape(1, -1)
     system.ravel()[:: len(system) + 1] += 1.0
-    factor, ends = cholesky(system), _incidence(*root.shape)
+    factor, ends = cholesky(system), incidence(*root.shape)
     if to_sense is not None:
         ends = np.hstack([ends, to_sense])
     return factor, solve_lower(factor, ends * root.reshape(-1, 1))
@@ -257,7 +257,7 @@ def end_admittance(skin: Skin) -> Float:
     whole = np.diag(shared.max(axis=0))
     coupling = wire_coupling_ohm(top_ohm, bottom_ohm, skin.shape)
     sign = np.diag(np.repeat([1.0, -1.0], (rows, columns)))
-    ends = np.block([[_incidence(rows, columns), np.zeros((cells, lines))], [sign, -sign]])
+    ends = np.block([[incidence(rows, columns), np.zeros((cells, lines))], [sign, -sign]])
     root = np.sqrt(np.concatenate([skin.cell_siemens.ravel(), np.ones(lines)]))[:, None]
     system = np.eye(len(root)) + root * np.block([[coupling, shared], [shared.T, whole]]) * root.T
     return admittance_of(solve_lower(cholesky(system), ends * root))

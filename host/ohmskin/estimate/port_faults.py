@@ -165,7 +165,6 @@ class LinePairs:
         shape = self._lines, self._lines
         self._alike_frames: NDArray[np.intp] = np.zeros(shape, dtype=np.intp)
         self._never_apart = np.ones(shape, dtype=bool)
-        self._is_first, self._is_full = True, False
 
     def were_shorted_at_rest(self, high: Bool) -> str:
         """The first pair of the lines `high` that was alike at rest already, in words, or empty.
@@ -187,11 +186,9 @@ class LinePairs:
         """
         if self._ports < 3:
             return False
-        return (
-            self._is_first
-            or self._is_full
-            or bool(np.count_nonzero(high) >= 2 or np.count_nonzero(touched) >= 2)
-        )
+        most = self._alike_frames.max()  # at least 1 after a frame: a line is like itself
+        is_wanted = most == 0 or most >= ALIKE_FRAMES
+        return bool(is_wanted or np.count_nonzero(high) >= 2 or np.count_nonzero(touched) >= 2)
 
     def compare(self, now: PortCurrents, high: Bool, places: NDArray[np.intp]) -> tuple[str, Bool]:
         """Compare all pairs of lines in a frame.
@@ -205,7 +202,6 @@ class LinePairs:
         shows_apart = apart > 2 * SAME_STDS
         self._alike_frames = np.where(shows_apart, 0, self._alike_frames + 1)
         self._never_apart &= ~shows_apart
-        self._is_first, self._is_full = False, bool(self._alike_frames.max() >= ALIKE_FRAMES)
         alike = np.triu(apart < SAME_STDS, 1)
         # Lines that hardly differed at rest are alike without any fault. So a pair counts only if
         # it differed at rest by clearly more than this frame's noise.

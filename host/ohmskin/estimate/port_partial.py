@@ -38,7 +38,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.configurations import READING_OFFSET, READING_SIGN, reference_ohm
+from ohmskin.circuit.configurations import (
+    READING_OFFSET,
+    READING_SIGN,
+    READINGS_PER_CELL,
+    reference_ohm,
+)
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import PortCurrents
 from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE
@@ -57,16 +62,16 @@ CLEAR_NOISES: Final = 4.0
 
 
 class Shown(NamedTuple):
-    """What a frame has shown.
+    """What the last frame of all readings has shown. Before there is one, offset and noise are 0.
 
-    ports: its currents.
-    offset_ratio: o_k of each reading (4,) [V/Vdd]; None: not all of the frame was read.
-    noise: v [V^2/Vdd^2]; None: the same.
+    ports: its currents, or newer ones of ports that were read since.
+    offset_ratio: o_k of each reading (4,) [V/Vdd].
+    noise: v [V^2/Vdd^2]; 0: not known.
     """
 
     ports: PortCurrents
-    offset_ratio: Float | None = None
-    noise: float | None = None
+    offset_ratio: Float
+    noise: float
 
 
 class PartialEnds:
@@ -79,7 +84,8 @@ class PartialEnds:
         self._reference = reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
         self._rounding = knowledge.ratio_std**2
         nothing = np.zeros((knowledge.rows, knowledge.columns))
-        self._rest = Shown(PortCurrents(nothing, nothing + 1.0 / knowledge.ref_ohm))
+        ports = PortCurrents(nothing, nothing + 1.0 / knowledge.ref_ohm)
+        self._rest = Shown(ports, np.zeros(READINGS_PER_CELL), 0.0)
         self.reset()
 
     def reset(self) -> None:
@@ -92,7 +98,7 @@ class PartialEnds:
         """A frame of all readings has shown this."""
         # The readings of a frame may all agree by chance. Such a frame, of noise 0, tells nothing.
         noises = [each for each in (shown.noise, self._rest.noise) if each]
-        self._last = shown._replace(noise=min(noises, default=None))
+        self._last = shown._replace(noise=min(noises, default=0.0))
         self.region = None
         self._age = np.zeros_like(self._age)
 
@@ -105,10 +111,7 @@ class PartialEnds:
         """Currents of all ports, by readings (R, C, 4) of which some are NaN."""
         kinds = ~np.isnan(ratio).all(axis=(0, 1))
         slope = (READING_SIGN * self._reference)[kinds]
-        signal = ratio - READING_OFFSET
-        if self._last.offset_ratio is not None:
-            signal -= self._last.offset_ratio
-        signal = signal[..., kinds]
+        signal = (ratio - READING_OFFSET - self._last.offset_ratio)[..., kinds]
         by_each = signal / slope
         # The rest readings may be a mean of many scans, which shows hardly any noise: a scan has at
         # least that of rounding.

@@ -440,8 +440,7 @@ class FewTouches:
         # Where wires matter, S^-1 weighs the readings; elsewhere their noise does, which is cheap.
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
-        self._untouched_std, wires = self._sharpened(ports)
-        self._compare()
+        wires = self._sharpen(ports)  # W
         residual_covariance = gram(wires, onto=np.eye(ports.size, order="F"))  # S
         factor = cholesky(residual_covariance)
         # The network was solved with the mean wires that the prior is about. `offset` is how the
@@ -525,18 +524,17 @@ class FewTouches:
         heavy[self.cells] = True
         return heavy
 
-    def _sharpened(self, ports: Cells) -> tuple[Float, Float]:
-        """s of all ports (RC,), made anew at m of them; and W at these m ports.
+    def _sharpen(self, ports: Cells) -> Float:
+        """Make s anew at m ports. Returns W at these.
 
-        At these ports, s has the noise of the readings and the drift of cells at rest as the
+        There, s has the noise of the readings and the drift of cells at rest as the
         touched network shows it. It no longer has the wires, because these are in S.
         """
         skin, square = self._skin, self._current[ports] ** 2
         by_cell, by_wire = self._touched.slopes(ports, skin.prior, skin.belief)
         by_cell *= skin.prior.std
         model_variance = square * square * np.einsum("ij,ij->i", by_cell, by_cell)
-        std = self._std.copy()
-        std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
-        std[self.cells] = self._reading_std[self.cells]
-        by_wire *= -(square / std[ports])[:, None]
-        return std, by_wire
+        self._untouched_std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
+        self._compare()
+        by_wire *= -(square / self._std[ports])[:, None]
+        return by_wire

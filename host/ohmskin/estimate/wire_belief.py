@@ -88,6 +88,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.skin import incidence
 from ohmskin.circuit.small import solve, solve_lower
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings
@@ -204,9 +205,7 @@ class WireBelief(ABC):
         self.shape, self.far, self._may_be_bent = shape, far, may_be_bent
         rows, columns = shape
         self._counts = rows * columns, rows * columns, rows + columns  # wires of each mean
-        by_row = np.kron(np.eye(rows), np.ones((columns, 1))) * (not far[0])
-        by_column = np.tile(np.eye(columns), (rows, 1)) * (not far[1])
-        self.leads_of_ports = np.hstack([by_row, by_column])
+        self.leads_of_ports: Float = np.abs(incidence(rows, columns)) * ~np.repeat(far, shape)
         self.untold = wires.both is None and not all(far)
         layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
         layer_stds = np.array([wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
