@@ -63,13 +63,7 @@ from ohmskin.circuit.ports import PortCircuit, port_difference
 from ohmskin.circuit.skin import Skin, end_admittance, impedance_of
 from ohmskin.doctor.circuit import LinesAndCells
 from ohmskin.doctor.findings import Diagnosis, Finding, Kind, LineWire, Place, lines_of
-from ohmskin.doctor.limits import (
-    ADC_ERROR_LSB,
-    CHANGED_SHARE,
-    FEW_STDS,
-    KNOWN_STD,
-    MANY_STDS,
-)
+from ohmskin.doctor.limits import ADC_ERROR_LSB, CHANGED_SHARE, FEW_STDS, KNOWN_STD, MANY_STDS
 from ohmskin.doctor.signal import Rest
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
@@ -97,7 +91,8 @@ MOST_LINE_OHM: Final = 50e3
 class FarSkin:
     """A skin by its mean readings of mode far, without the lines that `examine_far` leaves out.
 
-    shape: number of rows and columns that are kept.
+    kept: numbers of the rows, and of the columns, that are kept.
+    shape: how many these are.
     loss_std_floating: u, s and w of rows (3, R, C), and of columns (3, C, R) [ohm].
     silent: which rows, and which columns, have a far end that stays while the near end moves, or
         shows what the near end shows.
@@ -106,7 +101,7 @@ class FarSkin:
     """
 
     def __init__(self, rest: Rest, kept: list[list[int]]) -> None:
-        """kept: numbers of the rows, and of the columns, that are kept."""
+        self.kept = kept
         self._refs, ratio = (rest.board.ref_top_ohm, rest.board.ref_bottom_ohm), rest.ratio
         # A far node that floats keeps the voltage of the cell that was read before. A scan goes
         # down one column after the other.
@@ -214,18 +209,12 @@ class _Layer:
     """
 
     def __init__(
-        self,
-        axis: int,
-        kept: list[list[int]],
-        shorts: list[list[int]],
-        loss_std_floating: Float,
-        lead_ohm: tuple[float, float],
-        silent: Bool,
+        self, axis: int, skin: FarSkin, shorts: list[list[int]], lead_ohm: tuple[float, float]
     ) -> None:
-        self.axis, self.numbers, self.across = axis, kept[axis], kept[1 - axis]
-        self.loss_ohm, self.std_ohm, self.floating_ohm = loss_std_floating
+        self.axis, self.numbers, self.across = axis, skin.kept[axis], skin.kept[1 - axis]
+        self.loss_ohm, self.std_ohm, self.floating_ohm = skin.loss_std_floating[axis]
         self.shorts, (self.lead_ohm, self.lead_std_ohm) = shorts, lead_ohm
-        self._silent = silent
+        self._silent = skin.silent[axis]
         # The wire of a shorted line also carries currents of the lines that it is shorted to, so
         # that u = l + A r does not hold.
         self._alone = ~np.isin(self.numbers, [n for group in self.shorts for n in group])
@@ -523,11 +512,7 @@ def _wires_of(layers: Sequence[_Layer], lead_ohm: tuple[float, float]) -> WireOh
     return WireOhm(top, bottom, lead, top_log_std, bottom_log_std, lead_std_ohm)
 
 
-def examine_far(
-    rest: Rest,
-    near: LinesAndCells,
-    diagnosis: Diagnosis,
-) -> None:
+def examine_far(rest: Rest, near: LinesAndCells, diagnosis: Diagnosis) -> None:
     """Add the wires of all lines, and what is wrong with far ends.
 
     rest: readings of mode far. Where no wires are told, lines are compared with each other alone.
@@ -538,12 +523,7 @@ def examine_far(
         left_out = {*lines_of(is_open), *(n for group in shorts for n in group[1:])}
         kept.append([n for n in range(len(is_open)) if n not in left_out])
     skin, expected_lead = FarSkin(rest, kept), rest.lead_ohm
-    layers = [
-        _Layer(axis, kept, near.shorts[axis], loss_std_floating, expected_lead, silent)
-        for axis, (loss_std_floating, silent) in enumerate(
-            zip(skin.loss_std_floating, skin.silent, strict=True)
-        )
-    ]
+    layers = [_Layer(axis, skin, near.shorts[axis], expected_lead) for axis in (0, 1)]
     wire_ohm: Float = np.zeros((2, *skin.shape))
     for _ in range(ROUNDS):
         leads_ohm = sum(layer.lead_ohm for layer in layers)
@@ -563,5 +543,5 @@ def examine_far(
     lead_ohm = _agreed(*own_leads, *(() if rest.told.lead is None else (expected_lead,)))
     diagnosis.wires_by_far_ends = _wires_of(layers, lead_ohm)
     if np.isfinite(lead_ohm[1]):
-        figures = (round(each) for each in lead_ohm)
-        diagnosis.measured |= dict(zip(("lead_ohm", "lead_std_ohm"), figures, strict=True))
+        ohm, std_ohm = map(round, lead_ohm)
+        diagnosis.measured |= {"lead_ohm": ohm, "lead_std_ohm": std_ohm}

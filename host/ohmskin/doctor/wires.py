@@ -58,12 +58,7 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.configurations import current_std
 from ohmskin.circuit.ports import PortCircuit
 from ohmskin.doctor.findings import WHOLE_SKIN, Cell, Diagnosis, Kind, Place, WireShare
-from ohmskin.doctor.limits import (
-    CHANGED_SHARE,
-    FEW_STDS,
-    KNOWN_STD,
-    PRESSED_LSB,
-)
+from ohmskin.doctor.limits import CHANGED_SHARE, FEW_STDS, KNOWN_STD, PRESSED_LSB
 from ohmskin.doctor.signal import NOISE_S, Look, Rest, rounding_std_lsb, settling_values
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
