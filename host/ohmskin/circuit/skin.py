@@ -43,11 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.configurations import (
-    DEFAULT_REF_OHM,
-    check_references,
-    ratio_from_current,
-)
+from ohmskin.circuit.configurations import DEFAULT_REF_OHM, check_references, ratio_from_current
 from ohmskin.circuit.small import cholesky, one_blas_thread, solve, solve_lower
 
 # Wire segments of a layer [ohm]: one number if all are alike, which is faster, or (R, C).

@@ -69,11 +69,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.ports import PortCircuit
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings
-from ohmskin.estimate.prior import (
-    LAYER_STD,
-    MAX_STEP_LOG,
-    SEGMENT_STD,
-)
+from ohmskin.estimate.prior import LAYER_STD, MAX_STEP_LOG, SEGMENT_STD
 from ohmskin.estimate.wire_belief import Fit, WireBelief
 
 # Share of what is known of the layers that fades after each lesson, because skins bend. Chosen: as

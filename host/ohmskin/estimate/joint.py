@@ -162,8 +162,18 @@ class JointEstimator(Estimator):
             self._prior = self._finder = None
 
     def _solve(self, ports: PortReadings) -> Solution:
+        """The answer for one frame.
+
+        Where a fit moves what is believed of the wires too far for its slopes, the frame is fitted
+        again, and the last fit is the answer.
+        """
+        again = False
         try:
-            return self._answer(ports)
+            for _ in range(MOST_FITS):
+                solution, again = self._fitted(ports, again=again)
+                if not again:
+                    break
+            return solution
         except np.linalg.LinAlgError:
             # Impossible readings of far ends that are told to be exact do this: only a noise above
             # 0 keeps `far_wires` from dividing by 0. No other readings are known that do it. The
@@ -175,19 +185,6 @@ class JointEstimator(Estimator):
                 chi2=self._chi2(ports, ports.current),
                 message="the circuit that these readings lead to cannot be solved",
             )
-
-    def _answer(self, ports: PortReadings) -> Solution:
-        """The answer for one frame.
-
-        Where a fit moves what is believed of the wires too far for its slopes, the frame is fitted
-        again, and the last fit is the answer.
-        """
-        again = False
-        for _ in range(MOST_FITS):
-            solution, again = self._fitted(ports, again=again)
-            if not again:
-                break
-        return solution
 
     def _fitted(self, ports: PortReadings, *, again: bool) -> tuple[Solution, bool]:
         """One fit of a frame, and whether the frame has to be fitted again.
@@ -271,14 +268,12 @@ class JointEstimator(Estimator):
             self._whole, self._region = self._as_whole(prior, self._whole), None
         if self._region is None or not np.array_equal(self._region.region, ports.region):
             self._region = RegionFit(self._whole, ports.region)
-        if not self._region.fit(ports):
-            return None
-        if self._region.has_left():
+        explains = self._region.fit(ports)
+        if explains and self._region.has_left():
             self._whole = self._as_whole(prior, self._region)
             self._region = RegionFit(self._whole, ports.region, self._region.age)
-            if not self._region.fit(ports):
-                return None
-        return self._region
+            explains = self._region.fit(ports)
+        return self._region if explains else None
 
     def _as_whole(self, prior: CellPrior, answer: Answer) -> WholeFrame:
         """This answer, as what regions of later frames are fitted about."""
@@ -396,15 +391,9 @@ class JointEstimator(Estimator):
         if near and np.abs(means - self._rest_means)[:2].max() > LARGE_MOVE_LOG:
             return self._prior_by_rest(self._rest_ports, prior)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
-        least = [
-            least_log,
-            least_log,
-            LEAD_MOVE_OHM,
-            *np.maximum(SEGMENT_STD * np.abs(means[3:]), LEAK_MOVE_US),
-        ]
-        if (np.abs(means - prior.means) > least).any():
-            return prior.about(means)
-        return prior
+        least_us = np.maximum(SEGMENT_STD * np.abs(means[3:]), LEAK_MOVE_US)
+        least = [least_log, least_log, LEAD_MOVE_OHM, *least_us]
+        return prior.about(means) if (np.abs(means - prior.means) > least).any() else prior
 
     def _prior_by_level(self, ports: PortReadings) -> CellPrior:
         """All cells at the lowest level that this frame or one before it has shown.

@@ -5,7 +5,7 @@ Estimators, and the modules that prepare readings for them, are told a `SkinKnow
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -160,9 +160,8 @@ class SkinKnowledge:
     ) -> Self:
         """What is known of the skin at this board."""
         size, references = (board.rows, board.columns), (board.ref_top_ohm, board.ref_bottom_ohm)
-        names = MODES[board.mode]
-        known = cls(*size, *references, board.adc_bits, rest_ratio, nominal_wire_ohm, names)
-        return replace(known, ref_log_std=ref_log_std)
+        told, names = (rest_ratio, nominal_wire_ohm), MODES[board.mode]
+        return cls(*size, *references, board.adc_bits, *told, names, ref_log_std=ref_log_std)
 
     @property
     def checked_names(self) -> tuple[str, ...]:

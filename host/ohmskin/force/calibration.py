@@ -50,13 +50,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.configurations import READINGS_PER_CELL, is_near
-from ohmskin.estimate.knowledge import (
-    NO_WIRES,
-    WIRE_FIELDS,
-    SkinKnowledge,
-    WireOhm,
-    check_ratio,
-)
+from ohmskin.estimate.knowledge import NO_WIRES, WIRE_FIELDS, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require
