@@ -222,12 +222,10 @@ class Estimator(ABC):
             np.full((2, *shape), np.nan) if known is None else known
             for known in (solution.wire_ohm, solution.wire_ohm_std)
         )
-        if knowledge.ref_log_std:
-            wires_std = np.hypot(wires_std, knowledge.ref_log_std * wires)
+        wires_std = np.hypot(wires_std, knowledge.ref_log_std * wires)
         siemens, siemens_std = solution.cell_siemens, solution.cell_siemens_std
-        if knowledge.ref_log_std or ports.doubt.any():
-            relative_std = np.hypot(knowledge.ref_log_std, DOUBT_STD * ports.doubt)
-            siemens_std = np.hypot(siemens_std, relative_std * siemens)
+        relative_std = np.hypot(knowledge.ref_log_std, DOUBT_STD * ports.doubt)
+        siemens_std = np.hypot(siemens_std, relative_std * siemens)
         return Estimate(
             cell_siemens=siemens,
             cell_siemens_std=siemens_std,

@@ -30,7 +30,7 @@ from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.ohm import conductance_from_current
-from ohmskin.estimate.port_faults import cell_of
+from ohmskin.estimate.port_faults import LOSS_TEXT, worst_cell
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLEAR_LOG,
@@ -321,15 +321,12 @@ class JointEstimator(Estimator):
             return "wires resist too much: even cells at rest are uncertain"
         if fit.misfit > MAX_CHI2:
             return f"no resistances explain the readings: chi-square {fit.misfit:.1f}"
-        log_cells = fit.log_cells.reshape(self._shape)
-        if log_cells.min() < -np.log(HIGHEST_TOUCH_SIEMENS):
-            cell = cell_of(log_cells.argmin(), log_cells)
-            return f"{cell}: conducts more than any touch, is it a short?"
+        gain = -np.log(HIGHEST_TOUCH_SIEMENS) - fit.log_cells.reshape(self._shape)
+        short = worst_cell(gain, "conducts more than any touch, is it a short?")
+        if short or self.knowledge.rest_ratio is None:
+            return short
         loss = fit.log_cells - prior.expected - LOSS_STDS * prior.std
-        if self.knowledge.rest_ratio is not None and loss.max() > 0:
-            cell = cell_of(loss.argmax(), log_cells)
-            return f"{cell}: conducts less than at rest, is a line open?"
-        return ""
+        return worst_cell(loss.reshape(self._shape), LOSS_TEXT)
 
     @property
     def _hides_rest(self) -> bool:

@@ -92,6 +92,8 @@ NO_LOSS_STDS: Final = 3.5
 # Share of the sums that tell this loss which is left after each frame. Chosen: they remember some
 # thirty frames.
 FAR_MEMORY: Final = 0.97
+# What is said of a cell that conducts less than at rest.
+LOSS_TEXT: Final = "conducts less than at rest, is a line open?"
 
 # Near ends of rows are above their far ends, those of columns below.
 _TO_NEAR: Final = np.array([1.0, -1.0]).reshape(2, 1, 1)
@@ -308,21 +310,15 @@ class SkinFaults:
     def _short(self, now: PortCurrents) -> str:
         """A port with less resistance than a skin can have."""
         excess = now.current - self._highest - FAULT_STDS * now.std
-        worst = excess.argmax()
-        if excess.flat[worst] <= 0:
-            return ""
-        return f"{cell_of(worst, excess)}: less resistance than any touch leaves: is it a short?"
+        return worst_cell(excess, "less resistance than any touch leaves: is it a short?")
 
     def _loss(self, now: PortCurrents, rest: PortCurrents) -> str:
         """A current that is below that at rest, by more than drift and noise."""
         std = np.hypot(now.std, rest.std)
         loss = (1.0 - DRIFT_SHARE) * rest.current - now.current - FAULT_STDS * std
-        worst = loss.argmax()
-        if loss.flat[worst] <= 0:
-            return ""
         if np.count_nonzero(loss > 0) > 0.5 * loss.size:
             return "the whole skin conducts less than at rest: take the rest readings anew"
-        return f"{cell_of(worst, loss)}: conducts less than at rest, is a line open?"
+        return worst_cell(loss, LOSS_TEXT)
 
 
 class FarFaults:
@@ -443,6 +439,12 @@ def _highest_current(knowledge: SkinKnowledge) -> Float:
     top, bottom = (WIRE_SHARE * ohm for ohm in knowledge.nominal_wire_ohm.both)
     pressed = PortCircuit(np.full(shape, HIGHEST_TOUCH_SIEMENS), top, bottom)
     return np.asarray(1.0 / (pressed.port_ohm.reshape(shape) + knowledge.ref_ohm))
+
+
+def worst_cell(excess: Float, what: str) -> str:
+    """The cell with the largest excess (R, C), and what is wrong with it; empty if none is > 0."""
+    worst = excess.argmax()
+    return f"{cell_of(worst, excess)}: {what}" if excess.flat[worst] > 0 else ""
 
 
 def cell_of(index: int | np.intp, ports: Float) -> str:
