@@ -512,8 +512,6 @@ class TouchEstimator(JointEstimator):
         if self.knowledge.rest_ratio is None or self._belief.is_assumed:
             return None
         touched = touches.explain()
-        if touched is None:
-            return None
-        if touched.log_cells_std[touched.cells].max(initial=0.0) > CLEAR_LOG:
-            return None
-        return touched
+        if touched and touched.log_cells_std[touched.cells].max(initial=0.0) <= CLEAR_LOG:
+            return touched
+        return None
