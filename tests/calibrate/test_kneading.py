@@ -358,7 +358,7 @@ def test_a_rest_that_has_moved_between_recordings_is_no_force(
     forces = [(each.host_time_s, each.force_n) for given in whole for each in given.forces]
     time_s, force_n = np.transpose(forces)
     fit = kneading.learn(ForceLog(time_s, force_n, any_zero=True))
-    calibrator.calibration_of(fit.model(kneading.shape), fit.largest_n).save(out)
+    calibrator.calibration_of(fit.model(), fit.largest_n).save(out)
     assert fit.presses_left_out == 0
     assert skin.read_tips(out).rmse_n() < 0.08  # where the rest stays, it is 0.065
 
