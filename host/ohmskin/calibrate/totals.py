@@ -480,17 +480,14 @@ class TotalFit:
         )
 
     def _straight(self) -> tuple[float, float]:
-        """Level and steepness of the line that is most like log(x' / x0) by log(x / x0).
-
-        Errors of logs weigh as the root of the force: between shares of a force and newtons. With
-        shares alone, forces beyond the hardest one that was kneaded come out 3 % too small.
-        """
+        """Level and steepness of the line that is most like log(x' / x0) by log(x / x0)."""
         rises = self._totals.rise[self._on]
         top = float(np.quantile(rises, MOST_RISE_QUANTILE))
         x = top * np.geomspace(LEAST_RISE, 1.0, 50)
         log_contact = np.log(x / self._unit / self._loss(x / self._hard))
         force = np.exp(self._p[1] * log_contact)
-        steeper, level = np.polyfit(np.log(x / self._unit), log_contact, 1, w=np.sqrt(force))
+        weight = force / np.hypot(force, 0.1 * force[-1])
+        steeper, level = np.polyfit(np.log(x / self._unit), log_contact, 1, w=weight)
         return float(level), float(steeper)
 
     def _residual_share(self) -> float:
