@@ -97,6 +97,22 @@ def test_too_few_presses_or_cells_tell_nothing() -> None:
     assert smoothness(single[:0], single[:0], SHAPE) is None
 
 
+def test_fingers_on_two_rows_tell_the_same_upside_down() -> None:
+    """Two of the six quadratics are alike there. Rounding said what counted in place of one."""
+    shape, random = (2, 8), np.random.default_rng(3)
+    row, column = np.indices(shape)
+    middle = random.uniform(0, np.subtract(shape, 1), (100, 2))[..., None, None]
+    logs = -((row - middle[:, 0]) ** 2) - ((column - middle[:, 1]) / 2.5) ** 2
+    force_n = np.exp(logs + 0.05 * random.standard_normal(logs.shape))
+    pulls = []
+    for turned_n in (force_n, force_n[:, ::-1]):
+        cells_n = turned_n.reshape(len(turned_n), -1)
+        found = smoothness(cells_n, np.zeros_like(cells_n), shape)
+        assert found is not None
+        pulls.append(found.pull.reshape(2, *shape))
+    np.testing.assert_allclose(pulls[1][:, ::-1], pulls[0], atol=1e-6 * np.abs(pulls[0]).max())
+
+
 def test_the_strongest_scan_of_each_hardest_cell_is_taken() -> None:
     """A finger that rolls from cell 0 to cell 1, a pause, and another press."""
     hardest = [(0, 1.0), (0, 5.0), (0, 4.0), (1, 4.5), (1, 6.0), (1, 2.0), (2, 9.0), (2, 3.0)]

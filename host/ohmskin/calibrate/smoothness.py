@@ -13,7 +13,7 @@ symbol shape     meaning                                                        
 k                number of cells about the hardest one of a press
 u      (k,)      logs of the forces on these cells, with the gains as they are        1
 W      (k,)      weight of a cell, less if its force is small: diagonal               1
-Q      (k, 6)    orthonormal columns that span W times the quadratics of place        1
+Q      (k, <= 6) orthonormal columns that span W times the quadratics of place        1
 g, e   (C,)      changes of the log gains of cells, and of their exponents            1
 l      (k,)      log of the rise that an exponent belongs to                          1
 s                scatter of a press about its quadratic                               1
@@ -49,6 +49,9 @@ REACH, LEAST_SHARE = 2, 0.05
 SMALL_SHARE: Final = 0.1
 # A press counts with so many cells or more: a quadratic explains six.
 LEAST_CELLS: Final = 8
+# Quadratics that differ by less than this share on the cells of a press are alike. Chosen: far
+# above rounding; where cells tell six quadratics apart, it is 0.005 or more.
+ALIKE_SHARE: Final = 1e-9
 # Scans of a press count whose force is at least this share of its highest. Chosen: at lower forces,
 # other cells seem to be the hardest ones.
 LEAST_OF_PRESS: Final = 0.5
@@ -108,13 +111,17 @@ def smoothness(force_n: Float, log_rise: Float, shape: tuple[int, int]) -> Smoot
         return None
     cell, counts, share = cell[some], counts[some], np.where(counts, share, 1.0)[some]
     weight = counts / np.hypot(1.0, SMALL_SHARE / share)
-    basis = np.linalg.qr(weight[..., None] * place)[0]
+    # Cells on two lines leave some quadratics alike: there, the columns that are left over point
+    # wherever rounding does, and count for nothing.
+    basis, size, _ = np.linalg.svd(weight[..., None] * place, full_matrices=False)
+    spans = size > ALIKE_SHARE * size[:, :1]
+    basis *= spans[:, None]
     # W (1 - Q Q^T) W of each press
     left = -np.einsum("mi,mik,mjk,mj->mij", weight, basis, basis, weight, optimize=True)
     np.einsum("mii->mi", left)[:] += weight**2
     pulled = np.einsum("mij,mj->mi", left, np.log(share))
     square = np.einsum("mi,mi->m", pulled, np.log(share)).clip(0.0)
-    variance = square / (counts.sum(axis=1) - place.shape[1])
+    variance = square / (counts.sum(axis=1) - spans.sum(axis=1))
     per_variance = 1.0 / (max(np.median(variance), LEAST_SCATTER**2) + variance)
     steep = np.take_along_axis(log_rise[some], cell, 1)
     of_both = np.stack([np.ones_like(steep), steep])
