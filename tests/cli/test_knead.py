@@ -270,6 +270,19 @@ def test_a_recording_that_has_no_scans_spoils_no_other() -> None:
     assert only.tares == [tare]
 
 
+def test_a_tare_of_another_mode_is_no_rest_of_a_recording() -> None:
+    """An older recording was read above its first tare, whatever that had read."""
+    bench = stepped("emulator://2x3")
+    scans = list(islice(bench, 3))
+    tare = Tare(scans[0].ratio, scans[0].host_time_s)
+    far = replace(tare, mode="far")
+    given = [
+        Recording([bench.info], scans, tares, [], [], cut_off=False)
+        for tares in ([far, tare], [far], [tare])
+    ]
+    assert [each.tares for each in joined(given)] == [[tare], [tare]]
+
+
 def test_the_map_shows_each_cell_and_where_to_press_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -56,14 +56,18 @@ def _kind(board: Hello) -> str:
 
 
 def joined(recordings: list[Recording]) -> list[Recording]:
-    """Those that have a rest and scans, on one clock.
+    """Those that have scans and a rest, on one clock, with the tares that are good for the scans.
 
     The rest moves from day to day, so each keeps its own. What the force sensor shows while nothing
     touches the skin, up to the tare, is taken off the forces of each. Of several forces of one
     time, the last counts. Raises ValueError if there is none, or if they are not of one skin in one
     mode.
     """
-    usable = [each for each in recordings if each.scans and each.tares]
+    usable = []
+    for given in recordings:
+        tares = [tare for tare in given.tares if given.scans and tare.is_of(given.scans[-1])]
+        if tares:
+            usable.append(replace(given, tares=tares))
     if not usable:
         raise ValueError("no recording has a rest, and touches after it")
     check_same(recordings, recordings[-1].hellos[-1])
