@@ -25,7 +25,7 @@ scatter s. So each press is a row of the least squares for g and e, with what th
 
     | (1 - Q Q^T) W (u + g + e l) |^2 / s^2 .
 
-s is what the presses themselves show: the median of all, or that of this press where this is more.
+s is what the presses themselves show: s^2 is the median of all, and that of this press added to it.
 Under a finger with edges, or under two, it is 0.1 to 0.3, and such presses tell little. Nor is a
 skin on an uneven plate loaded evenly. So a has a deviation (`OWN_STDS`), however many presses there
 are, and is eliminated: with N the sum of the rows above, and D the variances of a,
@@ -47,7 +47,8 @@ REACH, LEAST_SHARE = 2, 0.05
 # A cell that has this share of the hardest force has an error of its log that is larger by a
 # factor of 1.4. Chosen: hysteresis and force that is not seen matter there.
 SMALL_SHARE: Final = 0.1
-# A press counts with so many cells or more: a quadratic explains six.
+# A press counts with so many cells or more: a quadratic explains six. As many such presses are
+# needed: fewer show no scatter.
 LEAST_CELLS: Final = 8
 # Quadratics that differ by less than this share on the cells of a press are alike. Chosen: far
 # above rounding; where cells tell six quadratics apart, it is 0.005 or more.

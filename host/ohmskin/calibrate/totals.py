@@ -184,7 +184,7 @@ class TotalFit:
     """The fit of the module's equations.
 
     scale: the scale's filter; None: it is found. After `fit`: `scale_`; `covariance_` of k, b, c,
-    h, v, w, g, z and the delay.
+    h, v, w, g, e, z and the delay.
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class TotalFit:
         sizes = (5, offsets, cells, cells, self._basis.shape[1], int(totals.lags))
         ends = np.cumsum(sizes).tolist()
         parts = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
-        # p: k, b, c, h, v; w; g; z; delay
+        # p: k, b, c, h, v; w; g; e; z; delay
         self._of_wires, self._of_gains, self._of_bends, self._of_zero, self._of_delay = parts[1:]
         self._p = np.zeros(ends[-1])
         self._p[1:3] = EXPONENT, SERIES
