@@ -129,6 +129,16 @@ def test_a_press_that_is_left_out_is_named_by_its_recording(run: Run, tmp_path: 
     assert all(float(end) < 12.0 for _, _, end in spans)
 
 
+def test_what_far_ends_showed_is_known_after_a_short_recording(run: Run, tmp_path: Path) -> None:
+    """The wires of the last recording alone were kept: what the one before had shown was gone."""
+    out, stds = tmp_path / "skin.json", []
+    command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3&mode=far", str(out), *TRUTH)
+    for seconds in ("11", "2.2"):
+        well(run(*command, "--seconds", seconds))
+        stds.append(load_calibration(out).nominal_wire_ohm[3:])
+    assert (np.array(stds[1]) < 1.5 * np.array(stds[0])).all()
+
+
 @pytest.mark.parametrize("ends", [20, 60, 90], ids=["amid the tare", "unpressed", "pressed once"])
 def test_an_early_ctrl_c_is_no_error_and_kneading_goes_on(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: int

@@ -211,8 +211,7 @@ class Kneading:
     ) -> _Levels:
         """What a method shows of the scans to use, (n,); those that it doubts are left out.
 
-        wires: what is known of them. What the presses of a recording teach of them is known in the
-            next one; far ends show the wires of each recording anew.
+        wires: what is known of them. What a recording teaches of them is known in the next one.
         """
         pressed = self._press >= 0
         pauses = np.flatnonzero(used & ~pressed)
@@ -230,8 +229,7 @@ class Kneading:
             for n, scan in given:
                 answer = estimator.estimate(scan.ratio)
                 good[n], rise[n] = answer.converged, answer.level.ravel() - rest
-            if not self._calibrator.shows_wires:
-                wires = estimator.wires()
+            wires = estimator.wires()
         of_nothing = rise[good & wanted & ~pressed].max(axis=1, initial=0.0)
         least = PAUSE_TIMES * float(np.median(of_nothing)) if of_nothing.size else 0.0
         rise[(rise < min(least, TOUCH_SIEMENS)) | ~pressed[:, None]] = 0.0
