@@ -293,6 +293,7 @@ def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
         ({"--grams": "50,no"}, ["--grams '50,no': give 1 or more above 0"]),
         ({"--grams": "50,-1"}, ["give 1 or more above 0"]),
         ({"--grams": "50,50"}, ["a weight stands twice"]),
+        ({"--grams": "0.05,0.1,0.2"}, ["the least is 1 g: write 200 for 0.2 kg"]),
         (
             {"--grams": "50", "--repeats": "9"},
             ["--grams, --repeats, --cells: all 18 forces are"],

@@ -584,7 +584,7 @@ def test_two_weights_tell_what_a_number_is(
     assert_one_line(done, "the weights disagree by", "(200 g: -8", "500 g: -4", "): weigh again")
 
 
-@pytest.mark.parametrize("grams", ["200", "200,0", "a,b", "200,200"])
+@pytest.mark.parametrize("grams", ["200", "200,0", "a,b", "200,200", "0.2,0.5"])
 def test_a_scale_needs_two_weights(run: Run, grams: str) -> None:
     done = run("calibrate", "scale", "/dev/ttyNONE", "--grams", grams)
     assert_one_line(done, f"--grams '{grams}': ")

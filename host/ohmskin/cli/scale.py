@@ -18,6 +18,9 @@ from ohmskin.record.recording import ForceSample
 # Weights may disagree by this share about what a number means. Chosen: a load cell is a hundred
 # times better, and a finger that helps is worse.
 _OFF_SHARE: Final = 0.05
+# A lighter weight is refused [g]: it is in kilograms, and would make forces a thousandth of what
+# they are. Chosen: no skin feels one.
+_LEAST_G: Final = 1.0
 
 
 def grams_of(text: str, least: int = 1) -> list[float]:
@@ -29,6 +32,8 @@ def grams_of(text: str, least: int = 1) -> list[float]:
     good = len(masses_g) >= least and all(0 < mass_g < math.inf for mass_g in masses_g)
     if not good:
         raise ValueError(f"--grams {text!r:.60}: give {least} or more above 0, such as 50,100,200")
+    if min(masses_g) < _LEAST_G:
+        raise ValueError(f"--grams {text!r:.60}: the least is 1 g: write 200 for 0.2 kg")
     if len(set(masses_g)) < len(masses_g):
         raise ValueError(f"--grams {text!r:.60}: a weight stands twice")
     return masses_g
