@@ -283,6 +283,19 @@ def test_all_presses_can_be_redone(weigh: Run, tmp_path: Path) -> None:
     assert not table.exists()
 
 
+def test_presses_of_another_unit_are_not_gone_on_with(run: Run, tmp_path: Path) -> None:
+    """A calibration was learned from the presses of both skins, without a word."""
+    out = tmp_path / "skin.json"
+    port = "emulator://1x2?scene=weights&speed=0&unit="
+    words = ("--grams", "50,100,200", "--repeats", "1", *TOLD)
+    well(run("calibrate", "weights", f"{port}1", str(out), *words))
+    was = out.read_bytes()
+    done = run("calibrate", "weights", f"{port}2", str(out), *words)
+    assert_one_line(done, "skin.presses.csv: presses of unit 1, the board is unit 2: ")
+    assert out.read_bytes() == was
+    well(run("calibrate", "weights", f"{port}1", str(out), *words))
+
+
 def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
     out, port = str(tmp_path / "skin.json"), "emulator://1x2"
     table = tmp_path / "skin.presses.csv"

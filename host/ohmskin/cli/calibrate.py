@@ -124,6 +124,7 @@ def weights(
     kept = KeptPresses(beside(out, ".presses.csv"))
     with ohmskin.open(port) as skin:
         skin.only_unit = skin.info.unit_id  # no other may come while nobody looks
+        kept.go_on(skin.info.unit_id)
         shape = skin.info.rows, skin.info.columns
         only, again = cells_of(cells, shape), cells_of(" ".join(redo or ()), shape)
         wanted = [

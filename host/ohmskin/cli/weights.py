@@ -44,16 +44,29 @@ class KeptPresses:
 
     ratios: mean readings under each press, (n, R, C, 4); None: they are not known of all, as of a
         table that somebody else has made.
+    unit_id: of the board whose presses these are, kept beside the readings; None: it is not known.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self._readings_path = path, path.with_suffix(".npz")
         self.table: PressTable = load_press_table(path) if path.exists() else np.empty(0, PRESS)
         self.ratios: Float | None = None
+        self.unit_id: float | None = None
         if self._readings_path.exists() and self.table.size:
             ratios = load_readings(self._readings_path).ratio
             of_rows = _rows_of(self.table, load_arrays(self._readings_path, _KEYS), len(ratios))
             self.ratios = None if of_rows is None else ratios[of_rows]
+            if units := load_arrays(self._readings_path, ("unit_id",)):
+                self.unit_id = units["unit_id"].item()
+
+    def go_on(self, unit_id: int) -> None:
+        """Go on with presses of this board. Raises ValueError if those of before are another's."""
+        if self.unit_id not in (None, unit_id):
+            raise ValueError(
+                f"{self.path}: presses of unit {self.unit_id:.0f}, the board is unit {unit_id}: "
+                "write another calibration file, or move this table away"
+            )
+        self.unit_id = unit_id
 
     @property
     def presses(self) -> list[Press]:
@@ -105,7 +118,8 @@ class KeptPresses:
             self._readings_path.unlink(missing_ok=True)  # they are of some presses only
         else:
             keys = {name: self.table[name] for name in _KEYS}
-            save_arrays(self._readings_path, {"ratio": self.ratios} | keys)
+            unit = {} if self.unit_id is None else {"unit_id": np.array(self.unit_id)}
+            save_arrays(self._readings_path, {"ratio": self.ratios} | keys | unit)
         save_press_table(self.path, self.table)
 
 

@@ -78,7 +78,7 @@ _NAMES: Final = tuple(ENUMS["reading"].values)
 # Arrays that may be given for each frame, and how many dimensions they have if given once for all.
 _WIRES: Final = WIRE_FIELDS[:3]
 _ONCE_NDIM: Final = {"rest_ratio": 3} | dict.fromkeys(_WIRES, 0)
-_SCALARS: Final = {"ref_top_ohm", "ref_bottom_ohm", "ref_log_std", "adc_bits"}
+_SCALARS: Final = {"ref_top_ohm", "ref_bottom_ohm", "ref_log_std", "adc_bits", "unit_id"}
 _RATIOS: Final = ("ratio", "rest_ratio")
 # The arrays that go out, in this order.
 _OF_CELLS: Final = ("cell_ohm", "cell_siemens", "cell_siemens_std", "touched")
