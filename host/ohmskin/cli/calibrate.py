@@ -48,6 +48,7 @@ from ohmskin.errors import TareRefused
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
+from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.link.device import Device, mean_ratio, scans_for
 from ohmskin.link.messages import Hello
@@ -361,8 +362,7 @@ def _knead(
         text = f"numbers of the scale left out, far from those around them: {wrong.sum()}"
         TERMINAL.print(text)
     TERMINAL.print(f"{known} of {stds.size} cells have a gain of their own")
-    TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator))
-    TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}")
+    _conclude(calibration, calibrator, out)
 
 
 def _presses(count: int) -> str:
@@ -488,8 +488,14 @@ def _finish(
         TERMINAL.print(
             message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else "")
         )
+    _conclude(calibration, calibrator, out)
+
+
+def _conclude(calibration: Calibration, calibrator: Calibrator, out: Path) -> None:
+    """Say what was written. The largest force shows it if a sensor's newtons are none."""
     TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator))
-    TERMINAL.print(f"{out}: calibration of unit {calibration.unit_id}")
+    of = f"{out}: calibration of unit {calibration.unit_id}"
+    TERMINAL.print(f"{of}, by forces up to {calibration.largest_force_n:.3g} N on a cell")
 
 
 def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
