@@ -273,6 +273,7 @@ LOG = ForceLog(TIME_S, FORCE_N)
         (TIME_S / 100, FORCE_N, LOG, "the skin's rise lasts 0.3 s, 15 s are needed"),
         (TIME_S, FORCE_N, ForceLog(TIME_S / 4, FORCE_N), "the force lasts 7.5 s, 15 s are"),
         (TIME_S * MAX_SPAN_S / 20, FORCE_N, LOG, "the skin's rise lasts 9.0 h, more than 6"),
+        (TIME_S, FORCE_N, ForceLog(1000 * TIME_S, FORCE_N), "are its times in seconds?"),
         (
             np.where(TIME_S < 4, TIME_S, TIME_S + 100),
             np.where(TIME_S < 7, FORCE_N, 0.0),

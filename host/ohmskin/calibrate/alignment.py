@@ -124,7 +124,8 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, Bool]:
     if span_s < MIN_OVERLAP_S:
         raise ValueError(f"{name} lasts {span_s:.3g} s, {MIN_OVERLAP_S:g} s are needed")
     if span_s > MAX_SPAN_S:
-        raise ValueError(f"{name} lasts {span_s / 3600:.1f} h, more than 6: cut it into parts")
+        span = f"{name} lasts {span_s / 3600:.1f} h, more than 6"
+        raise ValueError(f"{span}: are its times in seconds? If so, cut it into parts")
     strong = float(np.percentile(values, 99))
     if values.min() == values.max() or values.max() <= 0:
         raise ValueError(f"{name} does not rise: nothing was pressed")
