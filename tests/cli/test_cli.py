@@ -357,7 +357,7 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
     ),
     "refused rows": (
         ["configure", EMULATED, "--rows", "0"],
-        ["bad_rows", "rows_max"],
+        ["bad_rows", "rows_max", "(at most 16x16)"],
     ),
     "rate out of range": (
         ["configure", EMULATED, "--rate", "60000"],
@@ -389,7 +389,10 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
     "emulation of a real port": (["emulate", "/dev/ttyACM99"], ["emulator://8x8"]),
     "unknown command": (["skin"], ["skin"]),
     "unknown option": (["info", EMULATED, "--fast"], ["--fast"]),
-    "missing argument": (["info"], ["port"]),
+    "missing argument": (["info"], ["port", "Usage: ohmskin info [OPTIONS] "]),
+    "missing file to write": (["export", "a.mcap"], ["Usage: ohmskin export ", "..."]),
+    "arguments in another order": (["flash", "/dev/ttyACM99", "uno"], ["(uno). Usage: "]),
+    "a recording as a port": (["stream", __file__ + ".mcap"], [f"replay://{__file__}.mcap"]),
     "missing option": (["estimate", READINGS], ["--method"]),
     "not a number": (["stream", EMULATED, "--scans", "many"], ["--scans"]),
 }

@@ -245,11 +245,11 @@ def test_edited_files_are_refused_by_field(
 @pytest.mark.parametrize(
     ("raw", "reason"),
     [
-        (b"", "no JSON of ours: "),
-        (b"\x89PNG\r\n\x1a\n", "no JSON of ours: "),
-        (b"[" * 100_000, "no JSON of ours: "),
-        (b'{"unit_id": 1, "a": {"b": 1, "b": 2}}', "no JSON of ours: field 'b' stands twice"),
-        (b'{"a": ' + b"9" * 5000 + b"}", "no JSON of ours: "),
+        (b"", "no calibration file: "),
+        (b"\x89PNG\r\n\x1a\n", "no calibration file: "),
+        (b"[" * 100_000, "no calibration file: "),
+        (b'{"unit_id": 1, "a": {"b": 1, "b": 2}}', "no calibration file: field 'b' stands twice"),
+        (b'{"a": ' + b"9" * 5000 + b"}", "no calibration file: "),
         (b"[]", "no calibration: field 'format' is not 'ohmskin calibration'"),
         (b"{}", "no calibration: field 'format' is not 'ohmskin calibration'"),
         (b" " * (MAX_FILE_BYTES + 1), f"more than {MAX_FILE_BYTES} bytes"),
@@ -279,7 +279,7 @@ def test_truncated_files_are_refused(tmp_path: Path) -> None:
     whole = path.read_bytes().rstrip()
     for length in range(0, len(whole), 97):
         path.write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=r"skin\.json: no JSON of ours"):
+        with pytest.raises(ValueError, match=r"skin\.json: no calibration file"):
             load_calibration(path)
 
 

@@ -111,6 +111,9 @@ def run(commands: Callable[..., Any], program: str) -> None:
         if message is None:
             raise
         if text := message():
+            context = getattr(exc, "ctx", None)
+            if context and text.startswith(("Missing argument", "Got unexpected")):
+                text = f"{text.rstrip('.')}. {context.get_usage()}"
             _fail(program, text)
         sys.exit(2)  # no command at all: the help is the answer
 

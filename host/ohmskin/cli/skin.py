@@ -15,7 +15,7 @@ from ohmskin.files import check_place
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.geometry import Geometry
 
-_NUMBER: Final = r"(\d+\.?\d*|\.\d+)"
+_NUMBER: Final = r"(?=[\d.]*[1-9])(\d+\.?\d*|\.\d+)"  # above 0
 
 
 def skin(
@@ -43,10 +43,8 @@ def skin(
         placed = Geometry.of_file(taxels, known.rows, known.columns, frame)
     elif pitch_mm or radius_mm:
         if not re.fullmatch(f"{_NUMBER},{_NUMBER}", pitch_mm):
-            raise ValueError(f"--pitch-mm wants two numbers, as 10,10, not '{pitch_mm}'")
+            raise ValueError(f"--pitch-mm wants two numbers above 0, as 10,10, not '{pitch_mm}'")
         told = {"pitch_m": 1e-3 * np.array([float(mm) for mm in pitch_mm.split(",")])}
-        if not told["pitch_m"].all():
-            raise ValueError(f"--pitch-mm wants two numbers above 0, not '{pitch_mm}'")
         if radius_mm:
             told["radius_m"] = np.array(1e-3 * radius_mm)
         kind = "cylinder" if radius_mm else "flat"

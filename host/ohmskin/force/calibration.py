@@ -272,7 +272,7 @@ def load_calibration(path: PathName) -> Calibration:
         try:
             content = json.loads(octets, object_pairs_hook=_once)
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"no JSON of ours: {error}") from error
+            raise ValueError(f"no calibration file: {error}") from error
         return _from_content(content)
 
 

@@ -113,9 +113,11 @@ def _explain(path: str, exc: Exception) -> tuple[str, str]:
     Systems call the same problem by different numbers and texts, and pyserial keeps either of them.
     """
     number = getattr(exc, "errno", None)
-    text = str(exc)
+    text, remedy = str(exc), "'ohmskin ports' lists the ports there are"
+    if path.endswith(".mcap"):
+        remedy = f"a recording is read as replay://{path}"
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFound" in text:
-        return f"no port {path}", "'ohmskin ports' lists the ports there are"
+        return f"no port {path}", remedy
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
         return f"{path} is busy", "close the other program that uses it"
     if number in (errno.EACCES, errno.EPERM) or "PermissionError" in text:
@@ -125,7 +127,7 @@ def _explain(path: str, exc: Exception) -> tuple[str, str]:
             "other program that uses it",
         )
     if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "configure port" in text:
-        return f"{path} is no serial port", "'ohmskin ports' lists the ports there are"
+        return f"{path} is no serial port", remedy
     return f"cannot open {path}: {text}", ""
 
 

@@ -203,6 +203,8 @@ class Session(Device):
                 raise DeviceLost(f"{self.name} does not answer '{name}': unplug and plug it again")
         if ack.result != "ok":
             reason = protocol.ENUMS["result"].docs.get(ack.result, "reason of a newer firmware")
+            if ack.result in ("bad_rows", "bad_columns"):
+                reason += f" (at most {self.info.rows_max}x{self.info.columns_max})"
             if ack.rate_mhz:
                 reason += f" (at most {ack.rate_mhz / 1000:g} scans/s)"
             raise CommandRefused(name, ack.result, reason)
