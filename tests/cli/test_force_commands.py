@@ -87,11 +87,23 @@ def test_stream_without_a_calibration_can_be_told_rest(run: Run) -> None:
     assert stds[1] < 0.8 * stds[0]
 
 
+NAMED = "'ohmskin configure PORT --unit-id 0 --save'"
+SIZED = "'ohmskin configure PORT --rows 8 --columns 8 --save'"
+
+
+def test_a_board_that_was_not_told_of_its_skin_is_told_how(run: Run, skin: Path) -> None:
+    """'tare --force' was told to force it, and whoever forgot --save to calibrate again."""
+    done = run("tare", "emulator://8x8?unit=5", str(skin), "--force")
+    assert_one_line(done, "of unit 0, the board is unit 5: calibrate this skin", NAMED)
+    done = run("tare", "emulator://6x8", str(skin))
+    assert_one_line(done, "of a 8x8 skin, the board scans 6x8: calibrate this skin", SIZED)
+
+
 def test_wrong_streams(run: Run, skin: Path) -> None:
     calibrated = ("--calibration", str(skin))
     for arguments, words in (
         ((GHOST, "--method", "joint", *calibrated), ["either --method or --calibration"]),
-        (("emulator://8x8?unit=5", *calibrated), ["of unit 0, the board is unit 5", "force"]),
+        (("emulator://8x8?unit=5", *calibrated), ["of unit 0, the board is unit 5", NAMED]),
         (("emulator://4x4", *calibrated, "--force"), ["of a 8x8 skin, the board scans 4x4"]),
         ((GHOST, "--method", "none", "--tare", "1"), ["leave out --method none"]),
         ((GHOST, "--calibration", "none.json"), ["none.json: cannot be read"]),

@@ -196,13 +196,16 @@ class Calibration:
         """
         if (board.rows, board.columns) != (self.rows, self.columns):
             sizes = f"{self.rows}x{self.columns} skin, the board scans {board.rows}x{board.columns}"
-            raise ValueError(f"this calibration is of a {sizes}: calibrate this skin")
+            told = f"'ohmskin configure PORT --rows {self.rows} --columns {self.columns} --save'"
+            remedy = f"calibrate this skin, or {told} if it is that one"
+            raise ValueError(f"this calibration is of a {sizes}: {remedy}")
         if board.mode != self.mode and not is_near((*MODES[board.mode], *MODES[self.mode])):
             remedy = f"'ohmskin configure PORT --mode {self.mode}', or calibrate this skin anew"
             raise ValueError(f"this calibration is of mode {self.mode}, not {board.mode}: {remedy}")
         if board.unit_id != self.unit_id and not force:
             units = f"unit {self.unit_id}, the board is unit {board.unit_id}"
-            remedy = "calibrate this skin, or force it if the same skin has a new board"
+            told = f"'ohmskin configure PORT --unit-id {self.unit_id} --save'"
+            remedy = f"calibrate this skin, or {told} if it is that one, with a new board"
             raise ValueError(f"this calibration is of {units}: {remedy}")
 
     def forces(self, rise: Float, rise_std: Float, touched: Bool) -> tuple[Float, Float]:
