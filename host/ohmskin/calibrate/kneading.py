@@ -79,9 +79,6 @@ CLOSE_STDS: Final = 0.7
 # Segments that nobody has told are at most this in the first trial [ohm]. Chosen: with wires that
 # are far too large, cells under much force conduct without limit, and the slopes tell nothing.
 START_OHM: Final = 50.0
-# Deviations of the wires are so many times those of the fit. Chosen: on 17 simulated skins, errors
-# were twice those. What a contact drifts by is alike in presses that follow each other.
-WIDER: Final = 2.0
 # Standard deviation with which a trial tells its segments to the estimator, of their logs. Chosen:
 # so small that no scan teaches it others.
 TRIAL_LOG_STD: Final = 1e-3
@@ -204,7 +201,7 @@ class Kneading:
                 used, is_first = self._in_stretches(TRIAL_CELLS), False
             elif (np.abs(step) < np.maximum(LAST_STEP, CLOSE_STDS * stds)).all():
                 break
-        (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(w).tolist(), (WIDER * stds).tolist()
+        (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(w).tolist(), stds.tolist()
         lead_std = wires.lead_std_ohm
         found = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std)
         return FoundWires(found, told, fit.presses, ())
