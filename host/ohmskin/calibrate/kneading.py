@@ -148,6 +148,8 @@ class Kneading:
         if not calibrator.shows_wires:
             calibrator.take_wires(self._found_wires(log))
         wires = calibrator.knowledge.nominal_wire_ohm
+        if not calibrator.shows_wires:  # the curves are of the wires that they were found with
+            wires = _held(wires)
         levels = self._levels(calibrator.method, wires, self._spaced(), progress)
         calibrator.estimator = levels.estimator
         return TotalFit(self._totals(levels, log)).fit()
@@ -186,9 +188,7 @@ class Kneading:
         used, is_first = self._in_stretches(FIRST_CELLS), True
         for _ in range(TRIALS):
             top_ohm, bottom_ohm = np.exp(w).tolist()
-            wires = WireOhm(
-                top_ohm, bottom_ohm, lead_ohm, TRIAL_LOG_STD, TRIAL_LOG_STD, lead_std_ohm
-            )
+            wires = _held(WireOhm(top_ohm, bottom_ohm, lead_ohm, lead_std_ohm=lead_std_ohm))
             levels = self._levels(DEFAULT_METHOD, wires, used)
             wires = levels.estimator.wires()
             lead_ohm = wires.lead or 0.0
@@ -293,3 +293,8 @@ class Kneading:
             log_siemens = solve_positive(system, by_wires)  # slopes of ports are those by log ohm
             slopes[:, n, pressed] = log_siemens.T * (siemens[pressed] / rises[n, pressed])
         return slopes
+
+
+def _held(wires: WireOhm) -> WireOhm:
+    """These wires, told so that no scan teaches other segments; leads are learned."""
+    return wires._replace(top_log_std=TRIAL_LOG_STD, bottom_log_std=TRIAL_LOG_STD)
