@@ -15,12 +15,16 @@ from command_line import Run, assert_one_line, well
 from kneaded_skin import KneadedSkin
 from kneaded_skin import Scale as ScaleBelow
 from ohmskin.arrays import Float
+from ohmskin.calibrate import kneading
 from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.scale import Scale, fit_scale, printed_s, wrong_numbers
 from ohmskin.calibrate.sessions import joined
 from ohmskin.calibrate.tables import ForceLog
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
+from ohmskin.estimate.base import Estimator
+from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan
 from ohmskin.record.recorder import Recorder
@@ -322,10 +326,23 @@ def test_wrong_numbers_of_the_scale_are_left_out(
     assert skin.read_tips(out).rmse_n() < 0.15
 
 
-def test_a_skin_that_was_kneaded_reads_forces(skin: KneadedSkin, run: Run, tmp_path: Path) -> None:
+def test_a_skin_that_was_kneaded_reads_forces(
+    skin: KneadedSkin, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
     skin.record_kneading(recording)
+    told: list[SkinKnowledge] = []
+
+    def spied(method: str, knowledge: SkinKnowledge) -> Estimator:
+        told.append(knowledge)
+        return make_estimator(method, knowledge)
+
+    monkeypatch.setattr(kneading, "make_estimator", spied)
     said = learned(run, recording, out)
+    # The trials, and the reading after them: no scan moves the segments amid the others.
+    wires = np.array([knowledge.nominal_wire_ohm for knowledge in told], dtype=np.float64)
+    assert wires[:, 3:5].max() < 0.01
+    assert wires[-1, :2].tolist() == pytest.approx([said["top"], said["bottom"]])
     assert said["left_out"] == []
     assert abs(said["lag_s"]) < 0.03
     calibration = load_calibration(out)
