@@ -79,9 +79,9 @@ CLOSE_STDS: Final = 0.7
 # Segments that nobody has told are at most this in the first trial [ohm]. Chosen: with wires that
 # are far too large, cells under much force conduct without limit, and the slopes tell nothing.
 START_OHM: Final = 50.0
-# Standard deviation with which a trial tells its segments to the estimator, of their logs. Chosen:
-# so small that no scan teaches it others.
-TRIAL_LOG_STD: Final = 1e-3
+# Deviation of the logs of segments that are held, in trials and in the last reading. Chosen: so
+# small that no scan teaches others.
+HELD_LOG_STD: Final = 1e-3
 
 
 class _Levels(NamedTuple):
@@ -145,11 +145,11 @@ class Kneading:
         calibrator = self._calibrator
         if not lags:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
+        wires = calibrator.knowledge.nominal_wire_ohm
         if not calibrator.shows_wires:
             calibrator.take_wires(self._found_wires(log))
-        wires = calibrator.knowledge.nominal_wire_ohm
-        if not calibrator.shows_wires:  # the curves are of the wires that they were found with
-            wires = _held(wires)
+            # The curves are of the wires that were found, and not of what scans would teach.
+            wires = _held(calibrator.knowledge.nominal_wire_ohm)
         levels = self._levels(calibrator.method, wires, self._spaced(), progress)
         calibrator.estimator = levels.estimator
         return TotalFit(self._totals(levels, log)).fit()
@@ -297,4 +297,4 @@ class Kneading:
 
 def _held(wires: WireOhm) -> WireOhm:
     """These wires, told so that no scan teaches other segments; leads are learned."""
-    return wires._replace(top_log_std=TRIAL_LOG_STD, bottom_log_std=TRIAL_LOG_STD)
+    return wires._replace(top_log_std=HELD_LOG_STD, bottom_log_std=HELD_LOG_STD)
