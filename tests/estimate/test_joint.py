@@ -161,8 +161,9 @@ def test_the_answer_is_where_the_posterior_is_highest(monkeypatch: pytest.Monkey
     known, measured = told(readings(rest)), ten_bits(readings(touch(rest, 3, random)))
     wires = WireOhm(100.0, 200.0, lead=500.0)
     belief = LearnedWires((3, 4), wires)
+    by_means = np.zeros((12, belief.means.size))
     prior = CellPrior(
-        -np.log(rest.cell_siemens.ravel()), np.full(12, REST_STD), np.zeros((12, 3)), belief.means
+        -np.log(rest.cell_siemens.ravel()), np.full(12, REST_STD), by_means, belief.means
     )
     shared = scipy.linalg.block_diag(*(np.ones((n, n)) for n in (12, 12, 7)))
     stds = np.repeat([LAYER_STD, LAYER_STD, LEAD_STD * 500.0], (12, 12, 7))
@@ -201,7 +202,8 @@ def test_a_lesson_has_the_residual_at_the_answer_and_not_one_step_before_it() ->
         touched = touch(rest, 3, random)
         ports = PortReader(told(readings(rest))).read(ten_bits(readings(touched)))
         expected = -np.log(rest.cell_siemens.ravel())
-        prior = CellPrior(expected, np.full(12, REST_STD), np.zeros((12, 3)), belief.means)
+        by_means = np.zeros((12, belief.means.size))
+        prior = CellPrior(expected, np.full(12, REST_STD), by_means, belief.means)
         start = -np.log(touched.cell_siemens.ravel()) + 0.01 * random.standard_normal(12)
         fit = FullFit(prior, belief, 6e4, ports, start)
 

@@ -18,10 +18,10 @@ from studies.trials import Trial, finger_trial, random_trial, trial_of
 METHODS = ("joint", "touch")
 
 
-def with_leads(trial: Trial, ohm: float) -> Trial:
-    """The same skin behind leads of about so many ohm, each 10 % off by itself."""
+def with_leads(trial: Trial, ohm: float, own: float = 0.1) -> Trial:
+    """The same skin behind leads of about so many ohm, each off by such a share by itself."""
     random = np.random.default_rng(1)
-    lead_ohm = ohm * np.exp(0.1 * random.standard_normal(sum(trial.rest.shape)))
+    lead_ohm = ohm * np.exp(own * random.standard_normal(sum(trial.rest.shape)))
 
     def led(skin: Skin) -> Skin:
         return replace(skin, lead_ohm=lead_ohm)
@@ -73,6 +73,24 @@ def test_leads_that_nobody_told_are_in_the_deviations(method: str, ohm: float) -
 def test_several_touches_teach_the_lead(method: str) -> None:
     behind = with_leads(random_trial(8, 8, 6, 25, seed=5), 600.0)
     assert estimates(behind, method, None)[1] == pytest.approx(600, rel=0.2)
+
+
+def test_touches_teach_what_the_lead_of_each_line_is() -> None:
+    """Late frames behind leads that differ are answered as well as behind leads that are alike."""
+
+    def late(behind: Trial) -> Float:
+        answers, _ = estimates(behind, "joint", 3000.0)
+        half = len(behind.frames) // 2
+        found = np.array([answer.cell_siemens for answer in answers])[half:]
+        true, pressed = behind.cell_siemens[half:], behind.pressed[half:]
+        return (np.abs(found - true) / true)[pressed]
+
+    trials = [random_trial(8, 8, 6, 60, seed) for seed in range(3)]
+    differ, alike = (
+        np.median(np.concatenate([late(with_leads(trial, 3000.0, own)) for trial in trials]))
+        for own in (0.1, 0.0)
+    )
+    assert differ < 1.4 * alike  # 1.9 where nothing is learned of single leads
 
 
 @pytest.mark.parametrize("ohm", [100.0, 1000.0])

@@ -145,7 +145,8 @@ def test_skins_drawn_from_the_prior_are_no_surprise(monkeypatch: pytest.MonkeyPa
     random, shape, ref_ohm = np.random.default_rng(0), (5, 6), 6e4
     belief = LearnedWires(shape, WireOhm(200.0, 400.0, lead=300.0))
     rest = np.log(random.uniform(1e5, 4e5, 30))
-    prior = NormalPrior(rest, np.full(30, REST_STD), np.zeros((30, 3)), belief.means)
+    by_means = np.zeros((30, belief.means.size))
+    prior = NormalPrior(rest, np.full(30, REST_STD), by_means, belief.means)
     noise = np.full(shape, 2e-8)
     surprises = []
     for _ in range(200):

@@ -312,13 +312,13 @@ class SilentFit:
     """A fit of a new touch, whose lesson says nothing."""
 
     log_cells = np.zeros(16)
-    lesson = Lesson(np.full((4, 3), 1e-9), np.zeros(4), np.eye(4))
+    lesson = Lesson(np.full((4, 11), 1e-9), np.zeros(4), np.eye(4))
 
 
 def test_a_lesson_that_says_nothing_asks_for_no_other_fit() -> None:
     """Whether fits before and after it expect the usual lead, or the one that is known."""
     belief = LearnedWires((4, 4), WireOhm())
-    slopes = np.zeros((4, 3))
+    slopes = np.zeros((4, belief.means.size))
     slopes[0, 2] = 1 / 600
     strong = Lesson(belief.per_mean_std(slopes), np.array([1.6, 0.0, 0.0, 0.0]), np.eye(4))
     gram = strong.per_mean_std @ strong.per_mean_std.T + np.eye(4)
@@ -349,30 +349,35 @@ def mixture(weights: Float, means: Float, covariances: Float) -> tuple[Float, Fl
     return mean, np.tensordot(shares, covariances, 1) + spread
 
 
+def wires_of(means: Float) -> Float:
+    """Logs of the 12 segments and the 5 leads of a 2x3 skin."""
+    return np.concatenate([np.repeat(means[:2], 6), means[2] * (1 + means[3:])])
+
+
 def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one() -> None:
     """Against the textbook's covariance form and likelihood: three lessons."""
     random = np.random.default_rng(8)
     belief = LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0, lead_std_ohm=20.0))
-    layers = scipy.linalg.block_diag(*(np.ones((n, 1)) for n in (6, 6, 5)))
-    prior = np.diag([LAYER_STD, LAYER_STD, 20.0]) ** 2
-    before = mean = steady_mean = wary_mean = np.array([np.log(100.0), np.log(200.0), 50.0])
+    prior = np.diag([LAYER_STD, LAYER_STD, 20.0, *[SEGMENT_STD] * 5]) ** 2
+    before = mean = steady_mean = wary_mean = np.array(
+        [np.log(100.0), np.log(200.0), 50.0, *[0] * 5]
+    )
     covariance = steady = wary = prior
-    scores, scale = np.zeros(2), np.repeat([1.0, 1.0, 0.01], (6, 6, 5))
+    scores, scale = np.zeros(2), np.array([1.0, 1.0, 0.01, *[1.0] * 5])
     for _ in range(3):
-        own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * mean[2]], (6, 6, 5))) ** 2
-        slopes, at_mean = scale * random.normal(size=(4, 17)), random.normal(size=4)
-        noise = slopes @ own @ slopes.T + np.diag(random.uniform(1, 2, 4))
-        by_mean = slopes @ layers
+        by_mean, at_mean = scale * random.normal(size=(4, 8)), random.normal(size=4)
+        noise = np.diag(random.uniform(1, 2, 4))
         factor = np.linalg.cholesky(by_mean @ covariance @ by_mean.T + noise)
         belief.take(Lesson(belief.per_mean_std(by_mean), at_mean, factor))
 
-        drifted = np.diag(np.maximum(np.diag(steady), [LAYER_STD**2] * 2 + [0.0]))
+        layers = np.diag(np.maximum(np.diag(steady)[:2], LAYER_STD**2))
+        drifted = scipy.linalg.block_diag(layers, steady[2:, 2:])
         faded = steady + STEADY_FADE * (drifted - steady)
         residual = at_mean - by_mean @ (steady_mean - mean)
         of_steady, moved, steady = learned(by_mean, noise, residual, faded)
         steady_mean = steady_mean + moved
 
-        changed = np.diag([*[UNKNOWN_LAYER_STD**2] * 2, wary[2, 2]])
+        changed = scipy.linalg.block_diag(np.eye(2) * UNKNOWN_LAYER_STD**2, wary[2:, 2:])
         residual = at_mean - by_mean @ (wary_mean - mean)
         both = [learned(by_mean, noise, residual, faded) for faded in (wary, changed)]
         likelihoods, moves, covariances = (np.array(each) for each in zip(*both, strict=True))
@@ -388,20 +393,26 @@ def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one() -> None:
     layer_std = np.sqrt(np.diag(covariance))[:2]
     assert belief.stds().layer_std == pytest.approx(max(wary_std))
     assert belief.stds().layer_std_ratio == pytest.approx(max(wary_std / layer_std))
-    np.testing.assert_allclose(belief.expected_wires, layers @ mean, rtol=1e-9)
-    own = np.diag(np.repeat([SEGMENT_STD, SEGMENT_STD, SEGMENT_STD * mean[2]], (6, 6, 5))) ** 2
-    whole = layers @ covariance @ layers.T + own
-    root = belief.per_std(np.eye(17)[:, :12], np.eye(17)[:, 12:], np.zeros((17, 3)))
-    np.testing.assert_allclose(root @ root.T, whole, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(root[:, -3:], belief.per_mean_std(layers), atol=1e-9)
     np.testing.assert_allclose(belief.means_std(), np.sqrt(covariance.diagonal()))
-    away = 0.1 * random.normal(size=20)
-    of_own = np.sqrt(np.diagonal(own)) * away[:-3]
-    wires = belief.wires_off(away[-3:], of_own[:12], of_own[12:])
-    np.testing.assert_allclose(wires, belief.expected_wires + root @ away, rtol=1e-9)
-    some = random.normal(size=(3, 17))
-    moved = belief.moved_since(before, belief.per_mean_std(some @ layers))
-    np.testing.assert_allclose(moved, some @ (belief.expected_wires - layers @ before), rtol=1e-9)
+    np.testing.assert_allclose(belief.expected_wires, wires_of(mean), rtol=1e-9)
+    # How wires follow the means: by differences.
+    steps = 1e-6 * np.eye(8)
+    by_means = np.array([(wires_of(mean + s) - wires_of(mean - s)) / 2e-6 for s in steps]).T
+    ports = np.array([1, 4])  # of row 0 and column 1, of row 1 and column 1
+    by_segment = random.normal(size=(2, 12))
+    slopes = np.hstack([by_segment, [[1, 0, 0, 1, 0], [0, 1, 0, 1, 0]]])  # by all wires
+    own = np.diag(np.repeat([SEGMENT_STD, 0.0], (12, 5))) ** 2
+    whole = slopes @ (by_means @ covariance @ by_means.T + own) @ slopes.T
+    root = belief.per_std(by_segment, np.zeros((2, 8)), ports)
+    np.testing.assert_allclose(root @ root.T, whole, rtol=1e-6)
+    np.testing.assert_allclose(root[:, -8:], belief.per_mean_std(slopes @ by_means), rtol=1e-6)
+    away, of_own = 0.1 * random.normal(size=8), SEGMENT_STD * random.normal(size=12)
+    expected = wires_of(mean + np.linalg.cholesky(covariance) @ away)
+    expected[:12] += of_own
+    np.testing.assert_allclose(belief.wires_off(away, of_own), expected, rtol=1e-9)
+    some = random.normal(size=(3, 8))
+    moved = belief.moved_since(before, belief.per_mean_std(some))
+    np.testing.assert_allclose(moved, some @ (mean - before), rtol=1e-9)
 
 
 def test_still_wires_are_known_better_than_wires_that_were_bent() -> None:
@@ -412,13 +423,14 @@ def test_still_wires_are_known_better_than_wires_that_were_bent() -> None:
     for lesson in range(25):
         true = np.array([np.log(130.0), np.log(170.0), 0.0])
         true[:2] += np.log(2.0) * (lesson >= 20)
-        slopes = random.normal(size=(4, 3)) * (5.0, 5.0, 0.01)
-        residual = slopes @ (true - belief.means) + random.normal(size=4)
+        slopes = np.zeros((4, belief.means.size))
+        slopes[:, :3] = random.normal(size=(4, 3)) * (5.0, 5.0, 0.01)
+        residual = slopes[:, :3] @ (true - belief.means[:3]) + random.normal(size=4)
         per_std = belief.per_mean_std(slopes)
         factor = np.linalg.cholesky(per_std @ per_std.T + np.eye(4))
         belief.take(Lesson(per_std, residual, factor))
         stds.append(belief.means_std()[:2].max())
-        errors.append(np.abs(belief.means - true)[:2].max())
+        errors.append(np.abs(belief.means[:3] - true)[:2].max())
     assert stds[19] < 0.07
     assert max(stds[20:]) > 1.7 * stds[19]
     assert errors[24] < 0.15
@@ -427,9 +439,10 @@ def test_still_wires_are_known_better_than_wires_that_were_bent() -> None:
 def test_a_calmer_frame_teaches_in_place_of_the_first() -> None:
     """The belief is that of a skin that the first frame of the touch never taught."""
     random = np.random.default_rng(9)
-    slopes = random.normal(size=(3, 5, 3)) * (1.0, 1.0, 0.01)  # of three frames, by the means
+    # Of three frames, by the means.
+    slopes = random.normal(size=(3, 5, 8)) * (1.0, 1.0, 0.01, 1.0, 1.0, 1.0, 1.0, 1.0)
     residual, noise = random.normal(size=(3, 5)), np.diag(random.uniform(1, 2, 5))
-    nominal = np.array([np.log(100.0), np.log(200.0), 50.0])
+    nominal = np.array([np.log(100.0), np.log(200.0), 50.0, *np.zeros(5)])
 
     def teach(belief: LearnedWires, frame: int, *, replace_last: bool = False) -> None:
         at_mean = residual[frame] - slopes[frame] @ (belief.means - nominal)
@@ -445,17 +458,17 @@ def test_a_calmer_frame_teaches_in_place_of_the_first() -> None:
     teach(never, 2)
     np.testing.assert_allclose(taught.means, never.means, rtol=1e-9)
     np.testing.assert_allclose(
-        taught.per_mean_std(np.eye(3)), never.per_mean_std(np.eye(3)), atol=1e-9
+        taught.per_mean_std(np.eye(8)), never.per_mean_std(np.eye(8)), atol=1e-9
     )
 
 
 def test_a_touch_alone_does_not_take_the_lesson_before_it_away() -> None:
     belief = LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0))
-    slopes = np.array([[1.0, 1.0, 0.01]] * 2)
+    slopes = np.array([[1.0, 1.0, 0.01, *[1.0] * 5]] * 2)
     lesson = Lesson(belief.per_mean_std(slopes), np.ones(2), 3.0 * np.eye(2))
     belief.take(lesson)
     taught = belief.means
-    nothing = Lesson(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 0)))
+    nothing = Lesson(np.zeros((0, 8)), np.zeros(0), np.zeros((0, 0)))
     belief.take(nothing)
     belief.take(nothing, replace_last=True)
     np.testing.assert_array_equal(belief.means, taught)

@@ -7,16 +7,17 @@ Symbols
 symbol shape          meaning                                                       unit
 ====== ============== ============================================================= ==========
 n                     number of means: the logs of the mean segment of each layer,
-                      the mean lead, and two leaks if there are any (`wire_belief`)
+                      the mean lead and what each line's differs from it by, and
+                      two leaks if there are any (`wire_belief`)
 x      (RC + n,)      log resistances of cells, and the means                       log ohm,
-                                                                                    ohm, uS
+                                                                                    ohm, 1, uS
 m      (RC + n,)      what the prior expects of x                                   as x
 P      (RC+n, RC+n)   covariance of the prior
 u      (RC + n,)      deviations from the prior: x = m + P^1/2 u                    1
 y, h   (RC,)          measured and modelled port currents per Vdd, over their noise 1
 J      (RC, RC + n)   dh / du                                                       1
-W      (RC, 2RC+R+C)  dh / dw times s, where w are the log segments and the leads,  1
-                      and s the deviation of each from its mean
+W      (RC, 2RC)      dh / dw times s, where w are the log segments, and s the      1
+                      deviation of each from its mean
 N      (RC, RC)       covariance of y by its noise and by W: by all that x lacks    1
 S      (RC, RC)       covariance of y by all that is not certain, N + J J^T         1
 O      (RC, RC + n)   J whitened: L^-1 J, with L L^T = S                            1
@@ -24,7 +25,7 @@ O      (RC, RC + n)   J whitened: L^-1 J, with L L^T = S                        
 
 Minimised is (y - h)^T N^-1 (y - h) + |u|^2. The prior of the cells has tails, and P is that of a
 normal: so P of the cells is made anew for these tails at every step (`CellPrior.normal`). What each
-wire differs by from its mean is small. So it is not in x, but is taken for noise, N = 1 + W W^T;
+segment differs by from its mean is small. So it is not in x, but is taken for noise, N = 1 + W W^T;
 after the fit, W^T S^-1 (y - h(u) + J u) is the most probable value of it, over s. The steps are
 those of Gauss-Newton in the space of the readings (Tarantola 2005, eq. 3.51),
 
@@ -119,10 +120,11 @@ class FullFit:
         """The circuit at the present state."""
         self._means = self._belief.means_off(self._mean_stds)
         self._circuit = self._belief.circuit(self.log_cells, self._means, PortCircuit)
-        series_ohm = self._ref_ohm + self._belief.lead_count * self._means[2]
+        leads_ohm = self._belief.leads_of_ports @ self._belief.lead_ohm(self._means)
         # A step may make the mean lead negative. Half of the references is far below what any port
         # has in series, and keeps the current finite.
-        self._modelled = 1.0 / (self._circuit.port_ohm + max(series_ohm, 0.5 * self._ref_ohm))
+        series_ohm = np.maximum(self._ref_ohm + leads_ohm, 0.5 * self._ref_ohm)
+        self._modelled = 1.0 / (self._circuit.port_ohm + series_ohm)
         self._residual = (self._current - self._modelled) * self._weight
         self._prior = self._prior.about(self._means)
         self._centre, self._variance = self._prior.normal(self.log_cells)
@@ -142,38 +144,25 @@ class FullFit:
         by_wires = self._circuit.by_wires()
         by_layers = by_wires.reshape(len(by_wires), 2, -1).sum(axis=2)
         self._by_segment = self._weighted(by_wires, SEGMENT_STD)
-        # N without leads; and what leads add to it, for each ohm^2 of their variance.
-        self._noise = gram(self._by_segment)
+        self._noise = gram(self._by_segment)  # N
         np.einsum("ii->i", self._noise)[:] += 1.0
-        self._by_lead = self._weighted(self._belief.leads_of_ports.copy())
-        self._of_leads = gram(self._by_lead)
         self._by_cell = self._weighted(self._circuit.by_cell())
-        by_mean_lead = np.full((self._modelled.size, 1), float(self._belief.lead_count))
-        direct = [by_layers, by_mean_lead]
+        direct = [by_layers, self._belief.by_leads(self._means)]
         if self._belief.has_leaks:
             direct.append(1e-6 * self._circuit.by_leaks())  # by uS
         # Cells at rest follow the means of the wires.
         by_rest = self._by_cell @ self._prior.by_means
         self._by_mean = self._weighted(np.hstack(direct)) + by_rest
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
-        self._own_lead_ohm = self._belief.own_lead_ohm(self._means)
         self._cell_std = np.sqrt(self._variance)
-        self._slopes, self._factor = self._factorised(self._cell_std)
+        self._slopes, self._factor = self._factorised(self._cell_std, self._noise.copy(order="F"))
 
-    def _with_leads(self, own_ohm: float) -> Float:
-        """N, if each lead has this deviation from the mean lead [ohm]."""
-        return self._noise + own_ohm**2 * self._of_leads
-
-    def _factorised(self, cell_std: Float, odd_lead_ohm: float = 0.0) -> tuple[Float, Float]:
-        """J for cells of these deviations (RC,), and L.
-
-        odd_lead_ohm: a further deviation of leads from the mean lead, which N does not have [ohm].
-        """
+    def _factorised(self, cell_std: Float, noise: Float) -> tuple[Float, Float]:
+        """J for cells of these deviations (RC,), and L with this N (RC, RC), overwritten."""
         cells = cell_std.size
         slopes = np.empty((cells, cells + self._mean_stds.size))
         np.multiply(self._by_cell, cell_std, out=slopes[:, :cells])
         slopes[:, cells:] = self._per_mean_std
-        noise = self._with_leads(float(np.hypot(self._own_lead_ohm, odd_lead_ohm)))
         return slopes, cholesky(gram(slopes, onto=noise))
 
     def _minimise(self) -> None:
@@ -250,17 +239,14 @@ class FullFit:
         self._mean_stds = self._mean_stds + share * stds_step
 
     def _find_wires(self) -> Float:
-        """`wires`, (2RC + R+C,): their means, and how much each differs from its mean.
+        """`wires`, (2RC + R+C,): their means, and how much segments differ from these.
 
         In the fit, these differences were noise of covariance W W^T. In a residual whose whole
         covariance is S, the most probable differences, over s, are W^T S^-1 times the residual.
         """
         segments_stds = self._probable_noise @ self._by_segment
-        leads_stds = self._own_lead_ohm * (self._probable_noise @ self._by_lead)
-        self._wires_square = float(segments_stds @ segments_stds + leads_stds @ leads_stds)
-        return self._belief.wires_off(
-            self._mean_stds, SEGMENT_STD * segments_stds, self._own_lead_ohm * leads_stds
-        )
+        self._wires_square = float(segments_stds @ segments_stds)
+        return self._belief.wires_off(self._mean_stds, SEGMENT_STD * segments_stds)
 
     @property
     def modelled(self) -> Float:
@@ -394,7 +380,7 @@ class FullFit:
         -J^T (N + J J^T)^-1 `slopes`.
         """
         by_cell = by_cell * self._cell_std
-        factor = cholesky(gram(by_cell, onto=self._with_leads(self._own_lead_ohm)))
+        factor = cholesky(gram(by_cell, onto=self._noise.copy(order="F")))
         return -self._cell_std[:, None] * (by_cell.T @ solve(factor, slopes))
 
     def gains_of_shorts(self, first: NDArray[np.intp], short_ohm: float) -> Float:
@@ -436,7 +422,8 @@ class FullFit:
         # A touched cell is noise of nearly any size; a cell at rest is known to its drift.
         touched = np.abs(self._prior.rise_stds(self.log_cells)) > TOUCHED_STDS
         cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
-        _, factor = self._factorised(cell_std, self._belief.odd_lead_ohm())
+        odd_leads = self._weighted(self._belief.odd_lead_ohm() * self._belief.leads_of_ports)
+        _, factor = self._factorised(cell_std, gram(odd_leads, onto=self._noise.copy(order="F")))
         return Lesson(self._per_mean_std, residual, factor)
 
 

@@ -388,8 +388,10 @@ class JointEstimator(Estimator):
         if near and np.abs(means - self._rest_means)[:2].max() > LARGE_MOVE_LOG:
             return self._prior_by_rest(self._rest_ports, prior)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
-        least_us = np.maximum(SEGMENT_STD * np.abs(means[3:]), LEAK_MOVE_US)
-        least = [least_log, least_log, LEAD_MOVE_OHM, *least_us]
+        lines = sum(self._shape)
+        least_us = np.maximum(SEGMENT_STD * np.abs(self._belief.leaks(means)), LEAK_MOVE_US)
+        least_share = [LEAD_MOVE_OHM / max(float(means[2]), LEAD_MOVE_OHM)] * lines
+        least = [least_log, least_log, LEAD_MOVE_OHM, *least_share, *least_us]
         return prior.about(means) if (np.abs(means - prior.means) > least).any() else prior
 
     def _prior_by_level(self, ports: PortReadings) -> CellPrior:

@@ -48,7 +48,7 @@ class WholeFrame:
             self.log_cells_std = answer.fitted_std
         self.wires_log_std, self.leads_log_std = answer.wires_log_std, answer.leads_log_std
         self.misfit, self.surprise = answer.misfit, answer.surprise
-        self.series_ohm = ref_ohm + belief.lead_count * belief.means[2]
+        self.series_ohm = ref_ohm + belief.leads_of_ports @ belief.lead_ohm(belief.means)
         self.net = belief.circuit(answer.log_cells, belief.means, RestNetwork)
         self.untouched = TouchedNetwork(self.net, NO_CELLS, np.zeros(0))
 
@@ -85,7 +85,8 @@ class RegionFit:
         self._eye = np.eye(region.size)
         self._right = np.empty((region.size, region.size + 1), order="F")
         by_cell, by_wires = whole.untouched.slopes(region, whole.prior, whole.belief, region)
-        square = ((self._rho + whole.series_ohm) ** -2.0)[:, None]
+        self._series_ohm = whole.series_ohm[region]
+        square = ((self._rho + self._series_ohm) ** -2.0)[:, None]
         self._by_wires = square * by_wires
         by_cell *= square * whole.log_cells_std
         self._model_covariance = gram(np.hstack([self._by_wires, by_cell]))  # S, but for readings
@@ -108,7 +109,7 @@ class RegionFit:
             # LAPACK's code, the last, is 0: as every cell conducts, the determinant is above 0.
             _, _, volt, _ = lapack.dgesv(self._eye + self._cell_volt * added, self._port_volt)
             rho = self._rho - added @ (self._port_volt * volt)
-            current = 1.0 / (rho + whole.series_ohm)
+            current = 1.0 / (rho + self._series_ohm)
             # The slopes by each cell, and the residual, whitened.
             self._right[:, :-1] = (volt * volt).T * siemens * (current * current)[:, None]
             self._right[:, -1] = measured - current

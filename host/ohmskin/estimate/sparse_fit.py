@@ -19,7 +19,7 @@ s      (RC,)          deviation of I by noise of readings, drift of cells at res
 r      (RC,)          residual (I_read - I) / s, I_read the measured currents            1
 J      (k, RC)        dI / dx / s                                                        1
 A      (k, k)         J J^T and the precision of the prior of x                          1
-W      (m, 2RC+R+C+n) dI / dw / s P^1/2 at the m ports where wires matter; w are the log 1
+W      (m, 2RC+n)     dI / dw / s P^1/2 at the m ports where wires matter; w are the log 1
                       segments and the leads, P is their covariance, n the number of
                       means (`wire_belief`)
 S      (m, m)         covariance of r at these ports by noise and wires, 1 + W W^T       1
@@ -184,9 +184,9 @@ class TouchedNetwork:
         by_cell[:, self._cells if fitted is None else fitted] = 0.0
         of_cells = by_cell @ prior.by_means
         if belief.has_leaks:
-            of_cells[:, 3:] += 1e-6 * self.by_leaks(ports)  # by uS
+            of_cells[:, -2:] += 1e-6 * self.by_leaks(ports)  # by uS
         by_wire = self._rest.by_wires_of(ports, current, sensed)
-        return by_cell, belief.per_std(by_wire, belief.leads_of_ports[ports], of_cells)
+        return by_cell, belief.per_std(by_wire, of_cells, ports)
 
     def by_leaks(self, ports: Cells) -> Float:
         """Slopes of rho of m ports by the leaks of rows, and of columns, (m, 2) [ohm / S].
@@ -263,7 +263,8 @@ class SparseFit:
 
     most: how many touches are still few. Frames with more have no answer here.
     least_log_siemens: a cell counts as touched if its log conductance is above this, (RC,).
-    series_ohm: the references and the leads of a port, which are in series with the skin [ohm].
+    series_ohm: the references and the leads of each port, which are in series with the skin,
+        (RC,) [ohm].
     net: the network of the untouched skin.
     untouched: the same as a `TouchedNetwork` without touches, from which each frame starts.
     current: port currents of the untouched skin per Vdd, (RC,) [S].
@@ -276,7 +277,7 @@ class SparseFit:
 
     def __init__(self, prior: CellPrior, belief: WireBelief, ref_ohm: float) -> None:
         self.prior, self.belief = prior, belief
-        self.series_ohm = ref_ohm + belief.lead_count * prior.means[2]
+        self.series_ohm = ref_ohm + belief.leads_of_ports @ belief.lead_ohm(prior.means)
         self.most = most_touches(belief.shape)
         self.least_log_siemens = -prior.expected + TOUCHED_STDS * prior.std
         self.net = net = belief.circuit(prior.expected, prior.means, RestNetwork)
@@ -290,7 +291,7 @@ class SparseFit:
         self.least_ohm = path_ohm - (self.series_ohm - ref_ohm)
         *layer_std, lead_std_ohm = belief.means_std()[:3].tolist()
         wires_std = np.hypot(max(layer_std), SEGMENT_STD) * path_ohm
-        self.path_std_ohm = wires_std + belief.lead_count * lead_std_ohm
+        self.path_std_ohm = wires_std + belief.leads_of_ports.sum(axis=1) * lead_std_ohm
 
     def find(self, ports: PortReadings) -> "FewTouches | None":
         """The touched cells of one frame; None if they are not few."""

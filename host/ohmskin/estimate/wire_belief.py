@@ -14,12 +14,13 @@ symbol shape      meaning                                                       
 R, C              number of rows and of columns
 W                 number of wires: 2RC segments and R+C leads
 w      (W,)       the wires: logs of the segments, then leads                     log ohm, ohm
-m      (n,)       log of the mean segment of each layer, top and bottom, and the  log ohm, ohm
-                  mean lead: n = 3. On a damp skin n = 5: also what neighbouring  uS
+m      (n,)       log of the mean segment of each layer, top and bottom; the mean log ohm, ohm
+                  lead; how much each line's lead differs from it, as a share of
+                  it: n = 3 + R+C. On a damp skin, two more: what neighbouring    uS
                   rows, and columns, leak into each other at each crossing
 V      (n, n)     its covariance; V0 before any frame
-s      (W,)       deviation of a wire from its mean, each by itself               log ohm, ohm
-L      (n, W)     ones: which wires are of which mean
+s      (2RC,)     deviation of a segment from its mean, each by itself            log ohm
+L      (n, W)     dw / dm: which wires are of which mean
 P      (W, W)     covariance of w, L^T V L + s^2
 J      (k, W)     slope of k readings by w, over their noise
 N      (k, k)     covariance of these readings if the means were known: of their  1
@@ -29,7 +30,7 @@ z      (k,)       residual of these readings at the mean                        
 ====== ========== =============================================================== ==========
 
 Leads are no logs, because a lead may be next to nothing, and because readings are nearly linear in
-them. P^1/2 has a column for each wire's own deviation (s), and one for each mean (L^T V^1/2).
+them. P^1/2 has a column for each segment's own deviation (s), and one for each of m (L^T V^1/2).
 
 There are two kinds of belief, and `joint` asks the same of both: `before_fit`, what this frame and
 those before say of the wires; `after_fit`, to learn from the fit. `LearnedWires`, below, is for
@@ -50,8 +51,9 @@ information A, the inverse of a covariance:
 V^1/2 the Cholesky factor of V, and V^T/2 its transpose.
 
 A single touch reveals nothing of the wires, because its own resistance is in the same reading. So N
-holds the touched cells as noise without limit. What single wires differ from their means by is not
-learned: frames of near ends say too little of it.
+holds the touched cells as noise without limit. What single segments differ from their means by is
+not learned: frames of near ends say too little of it. A lead is in all readings of its line, so
+each line's own is learned.
 
 A skin bends. So there are two filters. The steady one is for a skin that lies still, as most do:
 before a lesson, a small share of what it knows of the layers fades, so that it follows a slow
@@ -82,7 +84,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -179,7 +181,7 @@ class _State:
 class WireBelief(ABC):
     """Mean and covariance of the wires of a skin, and of its leaks, whoever has shown them.
 
-    Segments are in logs of ohms, leads in ohms, leaks in uS.
+    Segments are in logs of ohms, the mean lead in ohms, leaks in uS.
 
     shape: (rows, columns).
     far: whether rows, and columns, are sensed at their far ends.
@@ -204,7 +206,6 @@ class WireBelief(ABC):
         """
         self.shape, self.far, self._may_be_bent = shape, far, may_be_bent
         rows, columns = shape
-        self._counts = rows * columns, rows * columns, rows + columns  # wires of each mean
         self.leads_of_ports: Float = np.abs(incidence(rows, columns)) * ~np.repeat(far, shape)
         self.untold = wires.both is None and not all(far)
         layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
@@ -217,9 +218,12 @@ class WireBelief(ABC):
         lead_ohm, lead_std_ohm = wires.lead_or_usual(UNKNOWN_LEAD_STD_OHM)
         lead_std_ohm = max(lead_std_ohm, 1e-3)
         self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
-        self._prior_covariance = np.diag([*layer_stds, lead_std_ohm]) ** 2
+        # Where each line's own lead is in m.
+        self._of_lines = slice(3, 3 + rows + columns)
+        own = np.full(rows + columns, SEGMENT_STD)
+        self._prior_covariance = np.diag([*layer_stds, lead_std_ohm, *own]) ** 2
         nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in wires[:2]]
-        self._nominal: Float = np.array([*np.log(nominal), lead_ohm])
+        self._nominal: Float = np.array([*np.log(nominal), lead_ohm, *np.zeros(rows + columns)])
         self.reset()
 
     def expect_leaks(self, leaks_us: Float, stds_us: Float) -> None:
@@ -228,8 +232,9 @@ class WireBelief(ABC):
         leaks_us: from row to row, and from column to column, at each crossing (2,) [uS].
         stds_us: their deviations (2,) [uS].
         """
-        self._nominal = np.concatenate([self._nominal[:3], leaks_us])
-        stds = np.sqrt(np.diagonal(self._prior_covariance)[:3])
+        wires = self._of_lines.stop
+        self._nominal = np.concatenate([self._nominal[:wires], leaks_us])
+        stds = np.sqrt(np.diagonal(self._prior_covariance)[:wires])
         self._prior_covariance = np.diag(np.concatenate([stds, stds_us])) ** 2
         self.reset()
 
@@ -318,27 +323,39 @@ class WireBelief(ABC):
         """From row to row, and from column to column, at each crossing, by these means (n,) [S]."""
         if not self.has_leaks:
             return 0.0, 0.0
-        by_row, by_column = (1e-6 * max(leak, LOWEST_LEAK_US) for leak in means[3:].tolist())
+        by_row, by_column = (1e-6 * max(leak, LOWEST_LEAK_US) for leak in self.leaks(means))
         return by_row, by_column
+
+    def leaks(self, means: Float) -> Float:
+        """The leaks among these means (n,), or what else comes in their order, (2,), or none."""
+        return means[self._of_lines.stop :]
 
     @property
     def has_leaks(self) -> bool:
-        """Whether the means have two leaks after the lead."""
-        return len(self.means) > 3
+        """Whether the means have two leaks after the leads."""
+        return self.leaks(self.means).size > 0
 
-    @property
-    def lead_count(self) -> int:
-        """How many leads are in the readings of a port: those of its lines sensed at near ends."""
-        return 2 - sum(self.far)
+    def lead_ohm(self, means: Float) -> Float:
+        """The lead of each line by these means (n,), (R+C,) [ohm]."""
+        return np.asarray(means[2] * (1.0 + means[self._of_lines]))
 
-    def own_lead_ohm(self, means: Float) -> float:
-        """Deviation of a lead from the mean lead, where the means are these [ohm]."""
-        return SEGMENT_STD * abs(float(means[2]))
+    def by_leads(self, means: Float, ports: Any = slice(None)) -> Float:
+        """Slopes of the resistance of these ports by what their leads are made of, at these means.
+
+        By the mean lead, and by what each line's lead differs from it, (ports, 1 + R+C) [1, ohm].
+        """
+        leads = self.leads_of_ports[ports]
+        by_mean = leads @ (1.0 + means[self._of_lines])
+        return np.hstack([by_mean[:, None], means[2] * leads])
 
     @property
     def expected_wires(self) -> Float:
         """Expected wires w, (W,)."""
-        return np.repeat(self.means[:3], self._counts)
+        return self._wires_of(self.means)
+
+    def _wires_of(self, means: Float) -> Float:
+        segments = np.repeat(means[:2], self.leads_of_ports.shape[0])
+        return np.concatenate([segments, self.lead_ohm(means)])
 
     def means_std(self) -> Float:
         """Standard deviations of `means`, (n,)."""
@@ -381,35 +398,34 @@ class WireBelief(ABC):
         """J L^T V^1/2 from slopes by the means, J L^T: one row a reading, one column a mean."""
         return slopes @ self._root
 
-    def per_std(self, by_segment: Float, by_lead: Float, by_other: Float) -> Float:
-        """J P^1/2: by what wires have of their own (W columns), by what they share (one a mean).
+    def per_std(self, by_segment: Float, by_other: Float, ports: Any) -> Float:
+        """J P^1/2: by what segments have of their own (2RC columns), and by the means (n).
 
-        by_segment, by_lead: J of the log segments (2RC columns) and of the leads (R+C).
+        by_segment: J of the log segments (2RC columns) at these ports.
         by_other: J of the means (n columns), by what else follows them: leaks, cells at rest.
         """
-        segments, wires = by_segment.shape[1], sum(self._counts)
-        root = np.empty((len(by_segment), wires + len(self.means)))
+        segments = by_segment.shape[1]
+        root = np.empty((len(by_segment), segments + len(self.means)))
         np.multiply(by_segment, SEGMENT_STD, out=root[:, :segments])
-        np.multiply(by_lead, self.own_lead_ohm(self.means), out=root[:, segments:wires])
         by_mean = by_other.copy()
         by_mean[:, :2] += by_segment.reshape(len(root), 2, -1).sum(axis=2)
-        by_mean[:, 2] += by_lead.sum(axis=1)
-        root[:, wires:] = self.per_mean_std(by_mean)
+        by_mean[:, 2 : self._of_lines.stop] += self.by_leads(self.means, ports)
+        root[:, segments:] = self.per_mean_std(by_mean)
         return root
 
     def means_off(self, mean_stds: Float) -> Float:
         """The means (n,) that are so many deviations off: m + V^1/2 `mean_stds` (n,)."""
         return self.means + self._root @ mean_stds
 
-    def wires_off(self, mean_stds: Float, segments_off: Float, leads_off: Float) -> Float:
-        """w (W,): means `mean_stds` (n,) deviations off, and what wires differ from their means by.
+    def wires_off(self, mean_stds: Float, segments_off: Float) -> Float:
+        """w (W,): means `mean_stds` (n,) deviations off, and segments by more.
 
-        segments_off: of the logs of segments (2RC,). leads_off: of leads (R+C,) [ohm].
+        segments_off: what the logs of segments differ from their means by, (2RC,).
         """
+        wires = self._wires_of(self.means_off(mean_stds))
         # What comes from slopes holds as far as readings are linear in the logs.
-        logs_off = np.minimum(np.maximum(segments_off, -MAX_STEP_LOG), MAX_STEP_LOG)
-        common = np.repeat(self.means_off(mean_stds)[:3], self._counts)
-        return np.asarray(common + np.concatenate([logs_off, leads_off]))
+        wires[: segments_off.size] += np.clip(segments_off, -MAX_STEP_LOG, MAX_STEP_LOG)
+        return wires
 
     def moved_since(self, means: Float, per_mean_std: Float) -> Float:
         """What readings have moved since m was `means` (n,): J L^T (m - means)."""
@@ -417,7 +433,8 @@ class WireBelief(ABC):
 
     def segment_ohm(self, wires: Float) -> Float:
         """Top and bottom segments (2, R, C) [ohm] of a fit that found these wires w (W,)."""
-        return np.asarray(np.exp(wires[: 2 * self._counts[0]]).reshape(2, *self.shape))
+        segments = 2 * self.leads_of_ports.shape[0]
+        return np.asarray(np.exp(wires[:segments]).reshape(2, *self.shape))
 
     def segment_std(self) -> Float:
         """Standard deviation of the log of each segment, for (2, R, C)."""
@@ -430,7 +447,7 @@ class WireBelief(ABC):
         # the wires of such a line do not count.
         by_top, by_bottom = (0.0 if is_far else 1.0 for is_far in self.far)
         path = by_top * top.cumsum(axis=1) + by_bottom * bottom.cumsum(axis=0)
-        leads = self.leads_of_ports @ np.maximum(wires[2 * self._counts[0] :], 0.0)
+        leads = self.leads_of_ports @ np.maximum(wires[segments.size :], 0.0)
         return SkinWires(segments, segments * self.segment_std(), path.ravel() + leads)
 
     def believed_wires(self) -> SkinWires:
@@ -562,16 +579,20 @@ class LearnedWires(WireBelief):
 
     def _widened(self, before: _Filter, layers: Float) -> Float:
         """V (n, n), if of the layers no more is known than these variances (2,)."""
-        variances = np.diagonal(before.covariance).copy()
-        variances[:2] = np.maximum(variances[:2], layers)
-        return np.diag(variances)
+        covariance = before.covariance.copy()
+        covariance[:2] = covariance[:, :2] = 0.0
+        variances = np.diagonal(before.covariance)[:2]
+        covariance[:2, :2] = np.diag(np.maximum(variances, layers))
+        return covariance
 
     def _dried(self, before: _Filter) -> _Filter:
         """This filter, with leaks that are no better known than at first: a damp skin dries."""
-        first = np.diagonal(self._prior_covariance)[3:]
-        covariance = before.covariance.copy()
-        covariance[3:] = covariance[:, 3:] = 0.0
-        covariance[3:, 3:] = np.diag(np.maximum(np.diagonal(before.covariance)[3:], first))
+        if not self.has_leaks:
+            return before
+        covariance, leaks = before.covariance.copy(), slice(self._of_lines.stop, None)
+        covariance[leaks] = covariance[:, leaks] = 0.0
+        first, now = np.diagonal(self._prior_covariance), np.diagonal(before.covariance)
+        covariance[leaks, leaks] = np.diag(np.maximum(first, now)[leaks])
         return before._replace(covariance=covariance)
 
     def _wary_layer_stds(self) -> Float:
