@@ -321,8 +321,7 @@ def test_a_lesson_that_says_nothing_asks_for_no_other_fit() -> None:
     slopes = np.zeros((4, belief.means.size))
     slopes[0, 2] = 1 / 600
     strong = Lesson(belief.per_mean_std(slopes), np.array([1.6, 0.0, 0.0, 0.0]), np.eye(4))
-    gram = strong.per_mean_std @ strong.per_mean_std.T + np.eye(4)
-    belief.take(strong._replace(factor=np.linalg.cholesky(gram)))
+    belief.take(strong)
     belief.expect_usual_leads(False)
     known = belief.means[2]
     belief.expect_usual_leads(True)
@@ -367,7 +366,7 @@ def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one() -> None:
     for _ in range(3):
         by_mean, at_mean = scale * random.normal(size=(4, 8)), random.normal(size=4)
         noise = np.diag(random.uniform(1, 2, 4))
-        factor = np.linalg.cholesky(by_mean @ covariance @ by_mean.T + noise)
+        factor = np.linalg.cholesky(noise)
         belief.take(Lesson(belief.per_mean_std(by_mean), at_mean, factor))
 
         layers = np.diag(np.maximum(np.diag(steady)[:2], LAYER_STD**2))
@@ -426,9 +425,7 @@ def test_still_wires_are_known_better_than_wires_that_were_bent() -> None:
         slopes = np.zeros((4, belief.means.size))
         slopes[:, :3] = random.normal(size=(4, 3)) * (5.0, 5.0, 0.01)
         residual = slopes[:, :3] @ (true - belief.means[:3]) + random.normal(size=4)
-        per_std = belief.per_mean_std(slopes)
-        factor = np.linalg.cholesky(per_std @ per_std.T + np.eye(4))
-        belief.take(Lesson(per_std, residual, factor))
+        belief.take(Lesson(belief.per_mean_std(slopes), residual, np.eye(4)))
         stds.append(belief.means_std()[:2].max())
         errors.append(np.abs(belief.means[:3] - true)[:2].max())
     assert stds[19] < 0.07
@@ -446,9 +443,8 @@ def test_a_calmer_frame_teaches_in_place_of_the_first() -> None:
 
     def teach(belief: LearnedWires, frame: int, *, replace_last: bool = False) -> None:
         at_mean = residual[frame] - slopes[frame] @ (belief.means - nominal)
-        per_std = belief.per_mean_std(slopes[frame])
-        factor = np.linalg.cholesky(per_std @ per_std.T + noise)
-        belief.take(Lesson(per_std, at_mean, factor), replace_last=replace_last)
+        lesson = Lesson(belief.per_mean_std(slopes[frame]), at_mean, np.linalg.cholesky(noise))
+        belief.take(lesson, replace_last=replace_last)
 
     taught, never = (LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0)) for _ in range(2))
     teach(taught, 0)

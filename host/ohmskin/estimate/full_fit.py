@@ -155,15 +155,11 @@ class FullFit:
         self._by_mean = self._weighted(np.hstack(direct)) + by_rest
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
         self._cell_std = np.sqrt(self._variance)
-        self._slopes, self._factor = self._factorised(self._cell_std, self._noise.copy(order="F"))
-
-    def _factorised(self, cell_std: Float, noise: Float) -> tuple[Float, Float]:
-        """J for cells of these deviations (RC,), and L with this N (RC, RC), overwritten."""
-        cells = cell_std.size
-        slopes = np.empty((cells, cells + self._mean_stds.size))
-        np.multiply(self._by_cell, cell_std, out=slopes[:, :cells])
+        cells = self._cell_std.size
+        self._slopes = slopes = np.empty((cells, cells + self._mean_stds.size))  # J
+        np.multiply(self._by_cell, self._cell_std, out=slopes[:, :cells])
         slopes[:, cells:] = self._per_mean_std
-        return slopes, cholesky(gram(slopes, onto=noise))
+        self._factor = cholesky(gram(slopes, onto=self._noise.copy(order="F")))  # L
 
     def _minimise(self) -> None:
         """Take steps until one leaves out next to nothing (`_is_last`).
@@ -423,7 +419,8 @@ class FullFit:
         touched = np.abs(self._prior.rise_stds(self.log_cells)) > TOUCHED_STDS
         cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
         odd_leads = self._weighted(self._belief.odd_lead_ohm() * self._belief.leads_of_ports)
-        _, factor = self._factorised(cell_std, gram(odd_leads, onto=self._noise.copy(order="F")))
+        unlike = np.hstack([self._by_cell * cell_std, odd_leads])
+        factor = cholesky(gram(unlike, onto=self._noise.copy(order="F")))
         return Lesson(self._per_mean_std, residual, factor)
 
 

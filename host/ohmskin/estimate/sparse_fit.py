@@ -442,8 +442,7 @@ class FewTouches:
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
         wires = self._sharpen(ports)  # W
-        residual_covariance = gram(wires, onto=np.eye(ports.size, order="F"))  # S
-        factor = cholesky(residual_covariance)
+        factor = cholesky(gram(wires, onto=np.eye(ports.size, order="F")))  # of S
         # The network was solved with the mean wires that the prior is about. `offset` is how the
         # means that are believed now change these residuals, to first order.
         belief = self._skin.belief
@@ -479,12 +478,13 @@ class FewTouches:
         by_means = covariance_of_cells @ whitened.T @ solve_lower(factor, by_mean_std)
 
         def teach() -> Lesson:
-            # The lesson has more in its S. Touches are noise of nearly any size, because nobody
-            # knows how hard they are. And leads differ by more if the mean lead is not known.
+            # For the lesson, touches are noise of nearly any size, because nobody knows how hard
+            # they are. And leads differ by more if the mean lead is not known.
             by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
             odd_leads = belief.odd_lead_ohm() * by_ohm * belief.leads_of_ports[ports]
-            noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads])
-            unlimited = cholesky(gram(noise, onto=residual_covariance))
+            own = wires[:, : -len(belief.means)]
+            noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads, own])
+            unlimited = cholesky(gram(noise, onto=np.eye(ports.size, order="F")))
             return Lesson(by_mean_std, residual, unlimited)
 
         return self._answer(covariance_of_cells, np.abs(by_means), modelled, teach)

@@ -25,8 +25,9 @@ P      (W, W)     covariance of w, L^T V L + s^2
 J      (k, W)     slope of k readings by w, over their noise
 N      (k, k)     covariance of these readings if the means were known: of their  1
                   noise, of cells, and of what wires differ from their means by
-S      (k, k)     covariance of these readings, N + J L^T V L J^T                 1
-z      (k,)       residual of these readings at the mean                          1
+H      (k, n)     slope of these readings by the means, J L^T, whitened by N
+S      (k, k)     covariance of the whitened readings, 1 + H V H^T                1
+z      (k,)       whitened residual of these readings at the mean                 1
 ====== ========== =============================================================== ==========
 
 Leads are no logs, because a lead may be next to nothing, and because readings are nearly linear in
@@ -40,15 +41,10 @@ wires before the fit.
 
 A lesson of `LearnedWires` is one step of a Kalman filter,
 
-    m += V L J^T S^-1 z ,     V -= V L J^T S^-1 J L^T V .
+    m += V H^T S^-1 z ,     V -= V H^T S^-1 H V .
 
 The first frame of a touch is noisy, as it changes. A calmer one of the same touch takes its place:
-its step starts from m and V as they were before the touch. What its readings alone say of m is the
-information A, the inverse of a covariance:
-
-    A = L J^T N^-1 J L^T = V^-T/2 (1 - X)^-1 X V^-1/2 ,     X = V^T/2 L J^T S^-1 J L^T V^1/2 ,
-
-V^1/2 the Cholesky factor of V, and V^T/2 its transpose.
+its step starts from m and V as they were before the touch.
 
 A single touch reveals nothing of the wires, because its own resistance is in the same reading. So N
 holds the touched cells as noise without limit. What single segments differ from their means by is
@@ -66,10 +62,9 @@ Tracking and Navigation*, chapter 11.)
 
 The odds of a mixture are those before the lesson, times the exponential of a difference of scores.
 A score says how well the lesson was expected: it is the log likelihood, without terms that all have
-in common. With m_0 the mean that the fit had, d = m - m_0, g_0 = L J^T N^-1 z at m_0,
-g = g_0 - A d, V before and V' after the lesson,
+in common,
 
-    score = d . g_0 - d . A d / 2 + (g . V' g - log det(1 + V A)) / 2 .
+    score = - (z . S^-1 z + log det S) / 2 .
 
 What is believed is the mixture of both filters, with the odds `WARY_ODDS` of the wary one before
 any lesson. A filter adds up its scores, and at each lesson the sum keeps the share `MEMORY` of what
@@ -82,7 +77,6 @@ wary filter: if wires have just grown longer, cells conduct more than they seem 
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
@@ -91,7 +85,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.skin import incidence
-from ohmskin.circuit.small import solve, solve_lower
+from ohmskin.circuit.small import cholesky, solve_lower
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
@@ -126,9 +120,9 @@ CircuitT = TypeVar("CircuitT", bound=PortCircuit)
 class Lesson(NamedTuple):
     """What k readings of one frame say of the wires.
 
-    per_mean_std: J L^T V^1/2, (k, n).
-    residual: z, (k,).
-    factor: Cholesky factor of S, (k, k).
+    per_mean_std: J L^T V^1/2, (k, n), with the V that the fit had.
+    residual: of these readings at its m, (k,).
+    factor: Cholesky factor of N, (k, k).
     """
 
     per_mean_std: Float
@@ -467,29 +461,21 @@ class _Filter(NamedTuple):
     score: float = 0.0
 
 
-def _stepped(
-    filters: Sequence[_Filter],
-    covariances: Sequence[Float],
-    expected: Float,
-    information: Float,
-    pull: Float,
-) -> list[_Filter]:
-    """These filters after a lesson, before which their V are `covariances`, each (n, n).
+def _stepped(before: _Filter, covariance: Float, slopes: Float, residual: Float) -> _Filter:
+    """This filter after a lesson, before which its V is `covariance` (n, n).
 
-    expected: m_0, (n,). information: A, (n, n). pull: g_0 at `expected`, (n,).
+    slopes: H, (k, n). residual: z at the filter's own m, (k,).
     """
-    before = np.array(covariances)
-    after = np.linalg.inv(np.linalg.inv(before) + information)
-    off = np.array([one.means for one in filters]) - expected
-    here = pull - off @ information
-    moved = (after @ here[..., None])[..., 0]
-    scores = off @ pull - 0.5 * (off @ information * off).sum(axis=1)
-    scores += 0.5 * (here * moved).sum(axis=1)
-    scores -= 0.5 * np.linalg.slogdet(np.eye(len(pull)) + before @ information)[1]
-    return [
-        _Filter(one.means + move, covariance, MEMORY * one.score + score)
-        for one, move, covariance, score in zip(filters, moved, after, scores.tolist(), strict=True)
-    ]
+    by_means = slopes @ covariance
+    expected = by_means @ slopes.T
+    np.einsum("ii->i", expected)[:] += 1.0
+    factor = cholesky(expected)
+    whitened = solve_lower(factor, np.hstack([by_means, residual[:, None]]))
+    gain, misses = whitened[:, :-1], whitened[:, -1]
+    score = -0.5 * float(misses @ misses) - float(np.log(factor.diagonal()).sum())
+    return _Filter(
+        before.means + misses @ gain, covariance - gain.T @ gain, MEMORY * before.score + score
+    )
 
 
 def _mixture(one: _Filter, other: _Filter, odds: float) -> _Filter:
@@ -548,19 +534,20 @@ class LearnedWires(WireBelief):
         if len(residual) < 2:
             return
         # The lesson is counted in deviations of the belief that the fit had, but the step may start
-        # from an older belief. So the lesson is first brought to logs, and the belief taken out:
-        #     L J^T N^-1 = V^-T/2 (1 - X)^-1 V^T/2 L J^T S^-1     are the `weights`,
-        # X is `gain @ per_mean_std`, and A is `information`. The step from V and m of the older
-        # belief is V' = (V^-1 + A)^-1, m' = m + V' L J^T N^-1 z: the same as that by S above.
-        gain = solve(factor, per_mean_std).T
-        per_log = np.linalg.inv(self._root)
-        weights = per_log.T @ np.linalg.inv(np.eye(len(gain)) - gain @ per_mean_std) @ gain
-        information, pull = weights @ per_mean_std @ per_log, weights @ residual
+        # from an older belief. So its slopes are first brought to logs.
+        slopes = solve_lower(self._root, per_mean_std.T, transposed=True).T
+        both = solve_lower(factor, np.hstack([slopes, residual[:, None]]))
+        if len(both) > both.shape[1]:  # the same sums of squares and of products, in fewer rows
+            both = np.asarray(np.linalg.qr(both, mode="r"), np.float64)
+        slopes, residual = both[:, :-1], both[:, -1]
+
+        def stepped(before: _Filter, covariance: Float) -> _Filter:
+            here = residual - slopes @ (before.means - self.means)
+            return _stepped(before, covariance, slopes, here)
+
         steady, wary = map(self._dried, self._before_lesson)
-        expected = self._faded(steady), wary.covariance, self._changed(wary)
-        steady, stayed, changed = _stepped(
-            (steady, wary, wary), expected, self.means, information, pull
-        )
+        steady = stepped(steady, self._faded(steady))
+        stayed, changed = stepped(wary, wary.covariance), stepped(wary, self._changed(wary))
         wary = _mixture(stayed, changed, CHANGED_ODDS)
         self._filters = [steady, wary]
         believed = _mixture(steady, wary, WARY_ODDS)
