@@ -350,11 +350,16 @@ def mixture(weights: Float, means: Float, covariances: Float) -> tuple[Float, Fl
 
 def wires_of(means: Float) -> Float:
     """Logs of the 12 segments and the 5 leads of a 2x3 skin."""
-    return np.concatenate([np.repeat(means[:2], 6), means[2] * (1 + means[3:])])
+    segments = np.repeat(means[:2], 6) + (means[8:] if means.size > 8 else 0.0)
+    return np.concatenate([segments, means[2] * (1 + means[3:8])])
 
 
-def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one() -> None:
-    """Against the textbook's covariance form and likelihood: three lessons."""
+@pytest.mark.parametrize("segments", [0, 12])
+def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one(segments: int) -> None:
+    """Against the textbook's covariance form and likelihood: three lessons.
+
+    After the first, single segments are to be learned, or not.
+    """
     random = np.random.default_rng(8)
     belief = LearnedWires((2, 3), WireOhm(100.0, 200.0, lead=50.0, lead_std_ohm=20.0))
     prior = np.diag([LAYER_STD, LAYER_STD, 20.0, *[SEGMENT_STD] * 5]) ** 2
@@ -362,15 +367,27 @@ def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one() -> None:
         [np.log(100.0), np.log(200.0), 50.0, *[0] * 5]
     )
     covariance = steady = wary = prior
-    scores, scale = np.zeros(2), np.array([1.0, 1.0, 0.01, *[1.0] * 5])
-    for _ in range(3):
-        by_mean, at_mean = scale * random.normal(size=(4, 8)), random.normal(size=4)
+    scores, own = np.zeros(2), SEGMENT_STD**2 * np.eye(segments)
+    for lesson in range(3):
+        if segments and lesson == 1:
+            belief.learn_segments()
+            before, mean, steady_mean, wary_mean = (
+                np.concatenate([each, np.zeros(segments)])
+                for each in (before, mean, steady_mean, wary_mean)
+            )
+            covariance, steady, wary = (
+                scipy.linalg.block_diag(each, own) for each in (covariance, steady, wary)
+            )
+        by_mean, at_mean = random.normal(size=(4, mean.size)), random.normal(size=4)
+        by_mean[:, 2] *= 0.01
         noise = np.diag(random.uniform(1, 2, 4))
         factor = np.linalg.cholesky(noise)
         belief.take(Lesson(belief.per_mean_std(by_mean), at_mean, factor))
 
         layers = np.diag(np.maximum(np.diag(steady)[:2], LAYER_STD**2))
-        drifted = scipy.linalg.block_diag(layers, steady[2:, 2:])
+        drifted = scipy.linalg.block_diag(layers, steady[2:8, 2:8])
+        if mean.size > 8:
+            drifted = scipy.linalg.block_diag(drifted, own)
         faded = steady + STEADY_FADE * (drifted - steady)
         residual = at_mean - by_mean @ (steady_mean - mean)
         of_steady, moved, steady = learned(by_mean, noise, residual, faded)
@@ -395,21 +412,24 @@ def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one() -> None:
     np.testing.assert_allclose(belief.means_std(), np.sqrt(covariance.diagonal()))
     np.testing.assert_allclose(belief.expected_wires, wires_of(mean), rtol=1e-9)
     # How wires follow the means: by differences.
-    steps = 1e-6 * np.eye(8)
+    n = mean.size
+    steps = 1e-6 * np.eye(n)
     by_means = np.array([(wires_of(mean + s) - wires_of(mean - s)) / 2e-6 for s in steps]).T
     ports = np.array([1, 4])  # of row 0 and column 1, of row 1 and column 1
     by_segment = random.normal(size=(2, 12))
     slopes = np.hstack([by_segment, [[1, 0, 0, 1, 0], [0, 1, 0, 1, 0]]])  # by all wires
-    own = np.diag(np.repeat([SEGMENT_STD, 0.0], (12, 5))) ** 2
-    whole = slopes @ (by_means @ covariance @ by_means.T + own) @ slopes.T
-    root = belief.per_std(by_segment, np.zeros((2, 8)), ports)
-    np.testing.assert_allclose(root @ root.T, whole, rtol=1e-6)
-    np.testing.assert_allclose(root[:, -8:], belief.per_mean_std(slopes @ by_means), rtol=1e-6)
-    away, of_own = 0.1 * random.normal(size=8), SEGMENT_STD * random.normal(size=12)
+    unlearned = np.diag(np.repeat([0.0 if segments else SEGMENT_STD, 0.0], (12, 5))) ** 2
+    of_wires = by_means @ covariance @ by_means.T + unlearned
+    root = belief.per_std(by_segment, np.zeros((2, n)), ports)
+    np.testing.assert_allclose(root @ root.T, slopes @ of_wires @ slopes.T, rtol=1e-6)
+    np.testing.assert_allclose(root[:, -n:], belief.per_mean_std(slopes @ by_means), rtol=1e-6)
+    stds = np.sqrt(of_wires.diagonal())[:12].reshape(2, 2, 3)
+    np.testing.assert_allclose(np.broadcast_to(belief.segment_std(), stds.shape), stds, rtol=1e-6)
+    away, of_own = 0.1 * random.normal(size=n), SEGMENT_STD * random.normal(size=12)
     expected = wires_of(mean + np.linalg.cholesky(covariance) @ away)
     expected[:12] += of_own
     np.testing.assert_allclose(belief.wires_off(away, of_own), expected, rtol=1e-9)
-    some = random.normal(size=(3, 8))
+    some = random.normal(size=(3, n))
     moved = belief.moved_since(before, belief.per_mean_std(some))
     np.testing.assert_allclose(moved, some @ (mean - before), rtol=1e-9)
 

@@ -46,7 +46,10 @@ class Estimate:
         the noise of the readings and the error of both references (`SkinKnowledge.ref_log_std`),
         not what the method neglects. By noise alone, about 58 % of cells lie within one, 98 %
         within two, because rounding is uniform.
-    level: what a force is read from (R, C): cell_siemens; for `voltage`, a voltage over Vdd [1].
+    level: what a force is read from (R, C): cell_siemens; for `voltage`, a voltage over Vdd [1];
+        for `joint` and `touch`, the cell in series with what the wires up to it differ from the
+        means of their layers by [S]. A press alone shows nothing of that, so the curve of a cell
+        that was pressed has it in.
     level_std: its standard deviation (R, C), by noise alone: a calibration was learned through the
         same references.
     touched: which cells are touched (R, C); `Estimator.estimate` says by which rule.
@@ -109,6 +112,7 @@ class Solution:
     wire_ohm: segments of top and bottom layer (2, R, C) [ohm]; None: not estimated.
     wire_ohm_std: their standard deviation (2, R, C) [ohm]; None: not known.
     cell_siemens_std_down: standard deviation of errors downwards (R, C) [S]; None: as upwards.
+    level: as in `Estimate`; None: cell_siemens.
     """
 
     cell_siemens: Float
@@ -119,6 +123,7 @@ class Solution:
     wire_ohm: Float | None = None
     wire_ohm_std: Float | None = None
     cell_siemens_std_down: Float | None = None
+    level: Float | None = None
 
 
 class Estimator(ABC):
@@ -246,7 +251,10 @@ class Estimator(ABC):
 
     def _level(self, ratio: Float, solution: Solution) -> tuple[Float, Float]:
         """`Estimate.level` of readings (R, C, 4) that gave this solution, and its deviation."""
-        return solution.cell_siemens, solution.cell_siemens_std
+        if solution.level is None:
+            return solution.cell_siemens, solution.cell_siemens_std
+        share = solution.level / solution.cell_siemens
+        return solution.level, share**2 * solution.cell_siemens_std  # their resistances differ
 
     def _touched(self, solution: Solution) -> Bool:
         """Which cells are touched, by the rule of `estimate`.

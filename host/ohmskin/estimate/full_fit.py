@@ -52,7 +52,6 @@ from ohmskin.estimate.prior import (
     LEFT_OUT_STDS,
     MAX_ITERATIONS,
     MAX_STEP_LOG,
-    SEGMENT_STD,
     TOUCHED_STDS,
     UNLIMITED_STD,
     CellPrior,
@@ -87,6 +86,7 @@ class FullFit:
     log_cells_std: their posterior deviation, (RC,).
     wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
     leads_log_std: the part of it that comes from the mean lead, (RC,).
+    means: those of the wires (`wire_belief`), (n,).
     wires: logs of the segments, then the leads [ohm], (2RC + R+C,).
     iterations: steps taken.
     message: why it did not converge, or empty.
@@ -114,7 +114,9 @@ class FullFit:
         self._evaluate()
         self._minimise()
         self._conclude()
-        self.wires: Float = self._find_wires()  # now: a lesson would move the belief
+        # Now: a lesson would move the belief.
+        self.means: Float = self._belief.means_off(self._mean_stds)
+        self.wires: Float = self._find_wires()
 
     def _evaluate(self) -> None:
         """The circuit at the present state."""
@@ -143,16 +145,20 @@ class FullFit:
         self._moved_log = 0.0
         by_wires = self._circuit.by_wires()
         by_layers = by_wires.reshape(len(by_wires), 2, -1).sum(axis=2)
-        self._by_segment = self._weighted(by_wires, SEGMENT_STD)
-        self._noise = gram(self._by_segment)  # N
-        np.einsum("ii->i", self._noise)[:] += 1.0
-        self._by_cell = self._weighted(self._circuit.by_cell())
         direct = [by_layers, self._belief.by_leads(self._means)]
         if self._belief.has_leaks:
             direct.append(1e-6 * self._circuit.by_leaks())  # by uS
+        if self._belief.learns_segments:
+            direct.append(by_wires)
+        self._by_cell = self._weighted(self._circuit.by_cell())
         # Cells at rest follow the means of the wires.
         by_rest = self._by_cell @ self._prior.by_means
         self._by_mean = self._weighted(np.hstack(direct)) + by_rest
+        own_std, self._by_segment = self._belief.unlearned_std, self._weighted(by_wires)
+        self._noise = np.zeros((self._weight.size,) * 2, order="F")  # N
+        if own_std:
+            self._noise = own_std**2 * gram(self._by_segment)
+        np.einsum("ii->i", self._noise)[:] += 1.0
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
         self._cell_std = np.sqrt(self._variance)
         cells = self._cell_std.size
@@ -240,9 +246,10 @@ class FullFit:
         In the fit, these differences were noise of covariance W W^T. In a residual whose whole
         covariance is S, the most probable differences, over s, are W^T S^-1 times the residual.
         """
-        segments_stds = self._probable_noise @ self._by_segment
+        own_std = self._belief.unlearned_std
+        segments_stds = own_std * (self._probable_noise @ self._by_segment)
         self._wires_square = float(segments_stds @ segments_stds)
-        return self._belief.wires_off(self._mean_stds, SEGMENT_STD * segments_stds)
+        return self._belief.wires_off(self._mean_stds, own_std * segments_stds)
 
     @property
     def modelled(self) -> Float:
@@ -299,7 +306,9 @@ class FullFit:
         learned = np.einsum("ij,ij->j", whitened, whitened)
         self._free: float = max(self._current.size - float(learned.sum()), 1e-9)
         learned = learned[cells]
-        with_means = whitened[:, cells].T @ whitened[:, cell_std.size :]  # O^T O of cells and means
+        # O^T O of cells, and of layers and the mean lead.
+        shared = slice(cell_std.size, cell_std.size + 3)
+        with_means = whitened[:, cells].T @ whitened[:, shared]
         self._unnoticed, unnoticed_std = self._find_unnoticed(learned)
         if self._unnoticed.any():
             wider = np.where(self._unnoticed, unnoticed_std / cell_std, 1.0)
@@ -308,7 +317,7 @@ class FullFit:
             system = np.eye(len(added)) + coupling[:, cells][:, self._unnoticed] * added
             correction = solve_lower(cholesky(system), coupling)
             learned = learned - np.einsum("ij,ij->j", correction, correction)[cells]
-            with_means -= correction[:, cells].T @ correction[:, cell_std.size :]
+            with_means -= correction[:, cells].T @ correction[:, shared]
             learned = wider**2 * learned
             with_means *= wider[:, None]
             cell_std = wider * cell_std
@@ -394,7 +403,7 @@ class FullFit:
     def gains_of_yarns(self) -> Float:
         """How much better a broken yarn of each line explains the frame, (R+C,): as for shorts."""
         rows, columns = self._circuit.shape
-        by_wires = self._by_segment.reshape(-1, 2, rows, columns) / SEGMENT_STD
+        by_wires = self._by_segment.reshape(-1, 2, rows, columns)
         return self._gains(np.hstack([by_wires[:, 0].sum(axis=2), by_wires[:, 1].sum(axis=1)]))
 
     def _gains(self, changes: Float) -> Float:

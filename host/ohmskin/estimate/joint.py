@@ -96,6 +96,12 @@ LEAD_MOVE_OHM: Final = 20.0
 LONG_LINE_OHM: Final = 24e3
 
 
+# Single segments are learned if a line resists more than this from end to end [ohm], on skins of
+# at most so many cells. Chosen: with shorter lines it gains nothing, and larger skins take long.
+LEARNED_LINE_OHM: Final = 2400.0
+LEARNED_CELLS: Final = 128
+
+
 class JointEstimator(Estimator):
     """Finds all 3RC resistances: cells and means of wires by steps, single wires as noise.
 
@@ -293,15 +299,20 @@ class JointEstimator(Estimator):
         belief = self._belief
         if not isinstance(fit, RegionFit):
             self._whole, self._whole_message = fit, message
-        wires = belief.wires(fit.wires) if isinstance(fit, FullFit) else belief.believed_wires()
+        wires = belief.believed_wires()
+        if isinstance(fit, FullFit):
+            wires = belief.wires(fit.wires, fit.means)
         stds = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std, belief.stds()
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
         std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)
         # Where the model misses the readings by more than their noise, or by more than it expects
         # to, it is wrong somewhere. So all variances are widened by the ratio.
         wider = max(1.0, fit.misfit, fit.surprise) ** 0.5
+        cell_ohm = np.exp(fit.log_cells)
+        # At least half of the cell: what wires lack must not make it negative.
+        level = 1.0 / np.maximum(cell_ohm + wires.own_path_ohm, 0.5 * cell_ohm)
         return Solution(
-            cell_siemens=np.exp(-fit.log_cells).reshape(self._shape),
+            cell_siemens=(1.0 / cell_ohm).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),
             cell_siemens_std_down=wider * std_down.reshape(self._shape),
             chi2=self._chi2(ports, fit.modelled.reshape(self._shape)),
@@ -309,6 +320,7 @@ class JointEstimator(Estimator):
             message=message,
             wire_ohm=wires.segment_ohm,
             wire_ohm_std=wires.segment_std_ohm,
+            level=level.reshape(self._shape),
         )
 
     def _doubt(self, prior: CellPrior, fit: FullFit) -> str:
@@ -336,6 +348,14 @@ class JointEstimator(Estimator):
     def _line_ohm(self) -> float:
         """Resistance of the wire of a row or of a column, whichever is more, end to end [ohm]."""
         return float((np.exp(self._belief.means[:2]) * self._shape[::-1]).max())
+
+    @property
+    def _should_learn_segments(self) -> bool:
+        """Whether single segments matter, and are not being learned yet."""
+        if any(self._belief.far) or self._belief.learns_segments:
+            return False
+        rows, columns = self._shape
+        return rows * columns <= LEARNED_CELLS and self._line_ohm() > LEARNED_LINE_OHM
 
     def _start(self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None) -> Float:
         """Log resistances of the cells to start from, (RC,).
@@ -380,6 +400,9 @@ class JointEstimator(Estimator):
         a new prior and network. Where rows and columns are both sensed at far ends, no reading has
         the wires of its own lines in it. So there a change has to be larger before it matters.
         """
+        if self._should_learn_segments:
+            self._belief.learn_segments()
+            return self._prior_by_rest(self._rest_ports, prior)
         means = self._belief.means
         # Cells at rest follow the layers by slopes, which hold for small moves only. After a larger
         # move, the rest readings are fitted again. (Readings at far ends hardly depend on the
@@ -388,10 +411,11 @@ class JointEstimator(Estimator):
         if near and np.abs(means - self._rest_means)[:2].max() > LARGE_MOVE_LOG:
             return self._prior_by_rest(self._rest_ports, prior)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
-        lines = sum(self._shape)
-        least_us = np.maximum(SEGMENT_STD * np.abs(self._belief.leaks(means)), LEAK_MOVE_US)
-        least_share = [LEAD_MOVE_OHM / max(float(means[2]), LEAD_MOVE_OHM)] * lines
-        least = [least_log, least_log, LEAD_MOVE_OHM, *least_share, *least_us]
+        least = np.full(means.size, 0.5 * SEGMENT_STD)
+        least[:2], least[2] = least_log, LEAD_MOVE_OHM
+        least[3 : 3 + sum(self._shape)] = LEAD_MOVE_OHM / max(float(means[2]), LEAD_MOVE_OHM)
+        leaks = self._belief.leaks(least)
+        leaks[:] = np.maximum(SEGMENT_STD * np.abs(self._belief.leaks(means)), LEAK_MOVE_US)
         return prior.about(means) if (np.abs(means - prior.means) > least).any() else prior
 
     def _prior_by_level(self, ports: PortReadings) -> CellPrior:

@@ -88,7 +88,7 @@ _MAX_LOG_SIEMENS: Final = float(np.log(MAX_CELL_SIEMENS))
 
 
 class RestNetwork(PortCircuit):
-    """rho0, H and M of a skin whose cells all conduct, and whose wires are alike in each layer.
+    """rho0, H and M of a skin whose cells all conduct.
 
     cell_siemens: conductances of the cells, (RC,) [S]; given as (R, C).
     port_volt, sense_volt: H by the driven and by the sensed ends of the ports, (cells, ports).
@@ -135,7 +135,9 @@ class RestNetwork(PortCircuit):
             slopes *= sensed
         else:
             slopes *= slopes
-        slopes *= np.array(self.wire_ohm).reshape(2, 1, 1)
+        ohm = np.empty((2, *self.shape))
+        ohm[0], ohm[1] = self.wire_ohm
+        slopes *= ohm
         return slopes.reshape(len(cell_current), -1)
 
 
@@ -184,7 +186,7 @@ class TouchedNetwork:
         by_cell[:, self._cells if fitted is None else fitted] = 0.0
         of_cells = by_cell @ prior.by_means
         if belief.has_leaks:
-            of_cells[:, -2:] += 1e-6 * self.by_leaks(ports)  # by uS
+            belief.leaks(of_cells.T)[:] += 1e-6 * self.by_leaks(ports).T  # by uS
         by_wire = self._rest.by_wires_of(ports, current, sensed)
         return by_cell, belief.per_std(by_wire, of_cells, ports)
 

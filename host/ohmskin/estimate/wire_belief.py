@@ -17,9 +17,12 @@ w      (W,)       the wires: logs of the segments, then leads                   
 m      (n,)       log of the mean segment of each layer, top and bottom; the mean log ohm, ohm
                   lead; how much each line's lead differs from it, as a share of
                   it: n = 3 + R+C. On a damp skin, two more: what neighbouring    uS
-                  rows, and columns, leak into each other at each crossing
+                  rows, and columns, leak into each other at each crossing.
+                  Where wires are long, what each segment's log differs from its
+                  layer's mean by, 2RC more
 V      (n, n)     its covariance; V0 before any frame
-s      (2RC,)     deviation of a segment from its mean, each by itself            log ohm
+s      (2RC,)     deviation of a segment from its mean, each by itself; 0 if m    log ohm
+                  has single segments
 L      (n, W)     dw / dm: which wires are of which mean
 P      (W, W)     covariance of w, L^T V L + s^2
 J      (k, W)     slope of k readings by w, over their noise
@@ -47,9 +50,9 @@ The first frame of a touch is noisy, as it changes. A calmer one of the same tou
 its step starts from m and V as they were before the touch.
 
 A single touch reveals nothing of the wires, because its own resistance is in the same reading. So N
-holds the touched cells as noise without limit. What single segments differ from their means by is
-not learned: frames of near ends say too little of it. A lead is in all readings of its line, so
-each line's own is learned.
+holds the touched cells as noise without limit. A lead is in all readings of its line, so each
+line's own is learned. What single segments differ from their means by matters where wires resist
+much (`joint.LEARNED_LINE_OHM`), and only there is it learned: it costs time.
 
 A skin bends. So there are two filters. The steady one is for a skin that lies still, as most do:
 before a lesson, a small share of what it knows of the layers fades, so that it follows a slow
@@ -81,6 +84,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.ports import PortCircuit
@@ -149,11 +153,13 @@ class SkinWires:
     segment_ohm: segments of top and bottom layer, (2, R, C) [ohm].
     segment_std_ohm: their standard deviations, (2, R, C) [ohm].
     path_ohm: wires and leads between each cell and the sensed ends of its lines, (RC,) [ohm].
+    own_path_ohm: what of it comes from how single wires differ from their means, (RC,) [ohm].
     """
 
     segment_ohm: Float
     segment_std_ohm: Float
     path_ohm: Float
+    own_path_ohm: Float
 
 
 @dataclass(eq=False)
@@ -214,6 +220,8 @@ class WireBelief(ABC):
         self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
         # Where each line's own lead is in m.
         self._of_lines = slice(3, 3 + rows + columns)
+        # Where leaks are in m, and what segments differ from their means by: at first, nowhere.
+        self._of_leaks = self._of_segments = slice(3 + rows + columns, 3 + rows + columns)
         own = np.full(rows + columns, SEGMENT_STD)
         self._prior_covariance = np.diag([*layer_stds, lead_std_ohm, *own]) ** 2
         nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in wires[:2]]
@@ -227,10 +235,36 @@ class WireBelief(ABC):
         stds_us: their deviations (2,) [uS].
         """
         wires = self._of_lines.stop
+        self._of_leaks = slice(wires, wires + 2)
+        self._of_segments = slice(wires + 2, wires + 2)
         self._nominal = np.concatenate([self._nominal[:wires], leaks_us])
         stds = np.sqrt(np.diagonal(self._prior_covariance)[:wires])
         self._prior_covariance = np.diag(np.concatenate([stds, stds_us])) ** 2
         self.reset()
+
+    def learn_segments(self) -> None:
+        """From now on, learn what each segment's log differs from its layer's mean by."""
+        own = np.zeros(2 * self.leads_of_ports.shape[0])
+        self._of_segments = slice(self._nominal.size, self._nominal.size + own.size)
+        self._nominal = np.concatenate([self._nominal, own])
+        self._prior_covariance = self._with_segments(self._prior_covariance)
+        means = np.concatenate([self._known.means, own])
+        self._believe(means, self._with_segments(self._known.covariance))
+
+    def _with_segments(self, covariance: Float) -> Float:
+        """This covariance of m, if single segments are in m as well, of which nothing is known."""
+        own = SEGMENT_STD**2 * np.eye(2 * self.leads_of_ports.shape[0])
+        return np.asarray(block_diag(covariance, own), np.float64)
+
+    @property
+    def learns_segments(self) -> bool:
+        """Whether what single segments differ from their means by is in m."""
+        return self._of_segments.stop > self._of_segments.start
+
+    @property
+    def unlearned_std(self) -> float:
+        """s, the deviation of a segment's log from its mean that is not in m."""
+        return 0.0 if self.learns_segments else SEGMENT_STD
 
     def reset(self) -> None:
         """Forget what frames have shown."""
@@ -311,7 +345,9 @@ class WireBelief(ABC):
     def circuit(self, log_cells: Float, means: Float, kind: type[CircuitT]) -> CircuitT:
         """The skin with these logs of its cells (RC,), and these means (n,), without its leads."""
         siemens, leaks = np.exp(-log_cells).reshape(self.shape), self.leak_siemens(means)
-        return kind(siemens, *np.exp(means[:2]), far=self.far, leak_siemens=leaks)
+        # One number for all segments of a layer is faster than many that are alike.
+        wires = means[:2] if not self.learns_segments else self._log_segments(means)
+        return kind(siemens, *np.exp(wires), far=self.far, leak_siemens=leaks)
 
     def leak_siemens(self, means: Float) -> tuple[float, float]:
         """From row to row, and from column to column, at each crossing, by these means (n,) [S]."""
@@ -322,7 +358,7 @@ class WireBelief(ABC):
 
     def leaks(self, means: Float) -> Float:
         """The leaks among these means (n,), or what else comes in their order, (2,), or none."""
-        return means[self._of_lines.stop :]
+        return means[self._of_leaks]
 
     @property
     def has_leaks(self) -> bool:
@@ -348,8 +384,14 @@ class WireBelief(ABC):
         return self._wires_of(self.means)
 
     def _wires_of(self, means: Float) -> Float:
-        segments = np.repeat(means[:2], self.leads_of_ports.shape[0])
-        return np.concatenate([segments, self.lead_ohm(means)])
+        return np.concatenate([self._log_segments(means).ravel(), self.lead_ohm(means)])
+
+    def _log_segments(self, means: Float) -> Float:
+        """Logs of top and bottom segments by these means (n,), (2, R, C) [log ohm]."""
+        logs = np.repeat(means[:2], self.leads_of_ports.shape[0])
+        if self.learns_segments:
+            logs += means[self._of_segments]
+        return logs.reshape(2, *self.shape)
 
     def means_std(self) -> Float:
         """Standard deviations of `means`, (n,)."""
@@ -395,17 +437,17 @@ class WireBelief(ABC):
     def per_std(self, by_segment: Float, by_other: Float, ports: Any) -> Float:
         """J P^1/2: by what segments have of their own (2RC columns), and by the means (n).
 
+        The first columns are missing where m has single segments.
         by_segment: J of the log segments (2RC columns) at these ports.
         by_other: J of the means (n columns), by what else follows them: leaks, cells at rest.
         """
-        segments = by_segment.shape[1]
-        root = np.empty((len(by_segment), segments + len(self.means)))
-        np.multiply(by_segment, SEGMENT_STD, out=root[:, :segments])
         by_mean = by_other.copy()
-        by_mean[:, :2] += by_segment.reshape(len(root), 2, -1).sum(axis=2)
+        by_mean[:, :2] += by_segment.reshape(len(by_mean), 2, -1).sum(axis=2)
         by_mean[:, 2 : self._of_lines.stop] += self.by_leads(self.means, ports)
-        root[:, segments:] = self.per_mean_std(by_mean)
-        return root
+        if self.learns_segments:
+            by_mean[:, self._of_segments] += by_segment
+            return self.per_mean_std(by_mean)
+        return np.hstack([SEGMENT_STD * by_segment, self.per_mean_std(by_mean)])
 
     def means_off(self, mean_stds: Float) -> Float:
         """The means (n,) that are so many deviations off: m + V^1/2 `mean_stds` (n,)."""
@@ -432,22 +474,33 @@ class WireBelief(ABC):
 
     def segment_std(self) -> Float:
         """Standard deviation of the log of each segment, for (2, R, C)."""
-        return np.asarray(np.hypot(self.means_std()[:2], SEGMENT_STD)[:, None, None])
+        if not self.learns_segments:
+            return np.asarray(np.hypot(self.means_std()[:2], SEGMENT_STD)[:, None, None])
+        segments = self._root[self._of_segments].reshape(2, -1, self._root.shape[1])
+        stds = np.linalg.norm(segments + self._root[:2, None], axis=2)
+        return np.asarray(stds.reshape(2, *self.shape))
 
-    def wires(self, wires: Float) -> SkinWires:
-        """The wires of an answer whose fit found these, w (W,)."""
-        top, bottom = segments = self.segment_ohm(wires)
+    def wires(self, wires: Float, means: Float) -> SkinWires:
+        """The wires of an answer whose fit found these, w (W,), and these means (n,)."""
+        segments = self.segment_ohm(wires)
+        leads = np.maximum(wires[segments.size :], 0.0)
+        path_ohm = self._path_ohm(segments, leads)
+        alike = np.exp(means[:2])[:, None, None] * np.ones(self.shape)
+        usual_ohm = self._path_ohm(alike, np.full_like(leads, max(float(means[2]), 0.0)))
+        return SkinWires(segments, segments * self.segment_std(), path_ohm, path_ohm - usual_ohm)
+
+    def _path_ohm(self, segments: Float, leads: Float) -> Float:
+        """Wires and leads up to each cell, (RC,), by segments (2, R, C) and leads (R+C,) [ohm]."""
         # A sensed far end has the potential of the cell, as no current flows from one to the other:
         # the wires of such a line do not count.
         by_top, by_bottom = (0.0 if is_far else 1.0 for is_far in self.far)
-        path = by_top * top.cumsum(axis=1) + by_bottom * bottom.cumsum(axis=0)
-        leads = self.leads_of_ports @ np.maximum(wires[segments.size :], 0.0)
-        return SkinWires(segments, segments * self.segment_std(), path.ravel() + leads)
+        path = by_top * segments[0].cumsum(axis=1) + by_bottom * segments[1].cumsum(axis=0)
+        return np.asarray(path.ravel() + self.leads_of_ports @ leads)
 
     def believed_wires(self) -> SkinWires:
         """The wires as believed, for answers whose fit took them so: made once for each belief."""
         if self._state.wires is None:
-            self._state.wires = wires = self.wires(self.expected_wires)
+            self._state.wires = wires = self.wires(self.expected_wires, self.means)
             for array in (wires.segment_ohm, wires.segment_std_ohm):
                 array.setflags(write=False)  # they are in more than one estimate
         return self._state.wires
@@ -498,6 +551,19 @@ class LearnedWires(WireBelief):
         self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
         known = _Filter(self._known.means, self._known.covariance)
         self._filters = self._before_lesson = [known] * 2
+
+    def learn_segments(self) -> None:
+        """As of any belief. Each filter learns them."""
+        super().learn_segments()
+
+        def with_segments(one: _Filter) -> _Filter:
+            means = np.concatenate([one.means, self._nominal[self._of_segments]])
+            return _Filter(means, self._with_segments(one.covariance), one.score)
+
+        self._filters, self._before_lesson = (
+            [with_segments(one) for one in filters]
+            for filters in (self._filters, self._before_lesson)
+        )
 
     def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
         """Nothing: before its touches are known, a frame of near ends shows no wires."""
@@ -556,7 +622,10 @@ class LearnedWires(WireBelief):
     def _faded(self, before: _Filter) -> Float:
         """V of a filter before a lesson, (n, n), if wires may have drifted since the last one."""
         told = np.minimum(np.diagonal(self._prior_covariance)[:2], LAYER_STD**2)
-        return before.covariance + STEADY_FADE * (self._widened(before, told) - before.covariance)
+        widened, own = self._widened(before, told), self._of_segments
+        widened[own] = widened[:, own] = 0.0
+        widened[own, own] = self._prior_covariance[own, own]
+        return before.covariance + STEADY_FADE * (widened - before.covariance)
 
     def _changed(self, before: _Filter) -> Float:
         """The same, if they have changed altogether."""
@@ -576,7 +645,7 @@ class LearnedWires(WireBelief):
         """This filter, with leaks that are no better known than at first: a damp skin dries."""
         if not self.has_leaks:
             return before
-        covariance, leaks = before.covariance.copy(), slice(self._of_lines.stop, None)
+        covariance, leaks = before.covariance.copy(), self._of_leaks
         covariance[leaks] = covariance[:, leaks] = 0.0
         first, now = np.diagonal(self._prior_covariance), np.diagonal(before.covariance)
         covariance[leaks, leaks] = np.diag(np.maximum(first, now)[leaks])
