@@ -307,6 +307,7 @@ void begin() {
     converter_begin();
     serial_speed(frames::BAUD_DEFAULT);
     WDTCSR |= _BV(WDIE);  // the first time-out interrupts, the second one resets
+    sei();
 }
 
 uint8_t reset_cause() { return reset_cause_bits; }
@@ -406,3 +407,12 @@ void eeprom_write(uint16_t address, uint8_t octet) {
 
 }  // namespace board
 }  // namespace ohmskin
+
+// In place of the Arduino core's main(), which would bring init() before setup(), and with it an
+// interrupt that counts milliseconds: begin() sets all registers that the firmware needs.
+extern "C" void setup();
+extern "C" void loop();
+int main() {
+    setup();
+    loop();
+}

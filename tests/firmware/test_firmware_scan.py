@@ -348,6 +348,23 @@ def test_random_bytes_change_nothing(rig: Rig, rng: np.random.Generator) -> None
     assert rig.damaged == 0
 
 
+def interrupts_of(board: str) -> list[int]:
+    """Vectors of the built firmware that lead somewhere else than an unused one."""
+    command = ["avr-objcopy", "-O", "binary", "-j", ".text", str(elf_of(board)), "/dev/stdout"]
+    code = subprocess.run(command, check=True, capture_output=True).stdout
+    vectors = {"uno": 26, "megaatmega2560": 57}[board]
+    jumps = np.frombuffer(code[: 4 * vectors], "<u2").reshape(vectors, 2)  # jmp and its address
+    assert set(jumps[:, 0]) == {0x940C}
+    targets, counts = np.unique(jumps[:, 1], return_counts=True)
+    return [n for n in range(1, vectors) if jumps[n, 1] != targets[counts.argmax()]]
+
+
+def test_the_firmware_has_no_interrupt_but_its_own(rig: Rig) -> None:
+    """The Arduino core's would make that of the slots late, and takes flash."""
+    watchdog, slots, received = {"uno": (6, 11, 18), "megaatmega2560": (12, 17, 25)}[rig.board]
+    assert interrupts_of(rig.board) == [watchdog, slots, received]
+
+
 def address_of(board: str, symbol: str) -> int:
     listing = subprocess.check_output(["avr-nm", elf_of(board)], text=True)
     return {line.split()[-1]: int(line.split()[0], 16) for line in listing.splitlines()}[symbol]
