@@ -19,9 +19,16 @@ using UsRest = uint16_t;
 
 // Whole microseconds of these clock cycles and the rest of those before, which stays below one.
 inline uint32_t us_of(uint32_t cycles, UsRest *rest) {
-    const uint32_t parts = cycles % CYCLES * CYCLES_US + *rest;
+    uint32_t whole = 0;
+    // A microsecond of whole cycles needs no multiplication, which could overflow, and so one
+    // division alone: spans are shorter than 2^32 - CYCLES.
+    if (CYCLES_US != 1) {
+        whole = cycles / CYCLES * CYCLES_US;
+        cycles = cycles % CYCLES * CYCLES_US;
+    }
+    const uint32_t parts = cycles + *rest;
     *rest = static_cast<UsRest>(parts % CYCLES);
-    return cycles / CYCLES * CYCLES_US + parts / CYCLES;
+    return whole + parts / CYCLES;
 }
 // Clock cycles of so many microseconds, rounded up.
 constexpr uint32_t cycles_of(uint16_t us) {

@@ -52,6 +52,12 @@ TEST(microseconds_of_many_spans_do_not_drift) {
         us += us_of(span, &rest);
     }
     CHECK(cycles * 1000000 / CLOCK_HZ == us);
+    // The longest span there may be, after as much of a microsecond as there may be.
+    const uint32_t longest = 0xFFFFFFFF - CYCLES;
+    rest = CYCLES - 1;
+    const uint64_t parts = uint64_t{longest} * CYCLES_US + rest;
+    CHECK_EQ(parts / CYCLES, us_of(longest, &rest));
+    CHECK_EQ(parts % CYCLES, rest);
     CHECK(uint64_t{cycles_of(43)} * 1000000 >= uint64_t{43} * CLOCK_HZ);
     CHECK(uint64_t{cycles_of(43) - 1} * 1000000 < uint64_t{43} * CLOCK_HZ);
 }
