@@ -2,6 +2,7 @@
 #pragma once
 #include <stdint.h>
 
+#include "core/attributes.h"
 #include "frames.h"
 
 namespace ohmskin {
@@ -29,5 +30,22 @@ class Crc16 {
     constexpr Crc16(uint8_t low, uint8_t high) : low_(low), high_(high) {}
     uint8_t low_, high_;
 };
+
+inline OHMSKIN_RARE Crc16 crc_of(const uint8_t *octets, uint8_t size) {
+    Crc16 crc;
+    for (; size != 0; size--)
+        crc.add(*octets++);
+    return crc;
+}
+
+// Bytes of a CRC: the low one comes first.
+constexpr uint8_t CRC_BYTES = 2;
+
+// Whether so many bytes end in the CRC of those before it.
+inline OHMSKIN_RARE bool ends_in_crc(const uint8_t *octets, uint8_t size) {
+    const uint8_t before = static_cast<uint8_t>(size - CRC_BYTES);
+    const Crc16 crc = crc_of(octets, before);
+    return octets[before] == crc.low() && octets[before + 1] == crc.high();
+}
 
 }  // namespace ohmskin

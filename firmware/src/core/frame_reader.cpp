@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/frame_reader.h"
 
-#include "core/crc16.h"
-
 namespace ohmskin {
 
 bool FrameReader::feed(uint8_t octet) {
@@ -31,13 +29,8 @@ void FrameReader::store(uint8_t octet) {
 
 bool FrameReader::finish() {
     const bool empty = code_ == 0 && !damaged_;
-    bool valid = !damaged_ && left_ == 0 && size_ >= FRAME_BYTES_MIN;
-    if (valid) {
-        Crc16 crc;
-        for (uint8_t i = 0; i < size_ - CRC_BYTES; i++)
-            crc.add(content_[i]);
-        valid = content_[size_ - CRC_BYTES] == crc.low() && content_[size_ - 1] == crc.high();
-    }
+    const bool valid =
+        !damaged_ && left_ == 0 && size_ >= FRAME_BYTES_MIN && ends_in_crc(content_, size_);
     // A delimiter alone is how a host flushes the line: not an error.
     if (!valid && !empty)
         errors_++;

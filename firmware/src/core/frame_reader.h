@@ -3,6 +3,7 @@
 #include <stdint.h>
 
 #include "core/attributes.h"
+#include "core/crc16.h"
 #include "frames.h"
 
 namespace ohmskin {
@@ -30,7 +31,7 @@ class FrameReader {
 
   private:
     // Bytes before the payload (type, sequence) and after it, and of a frame without payload.
-    static constexpr uint8_t HEADER_BYTES = 2, CRC_BYTES = 2;
+    static constexpr uint8_t HEADER_BYTES = 2;
     static constexpr uint8_t FRAME_BYTES_MIN = HEADER_BYTES + CRC_BYTES;
     static constexpr uint8_t CONTENT_MAX = FRAME_BYTES_MIN + PAYLOAD_MAX;
     // The length byte of a full COBS block: 254 bytes, after which no zero was left out.

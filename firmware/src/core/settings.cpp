@@ -23,18 +23,8 @@ constexpr uint8_t OLD_AT = 0;
 constexpr uint8_t NOWHERE = 0xFF;
 // A byte of EEPROM that was never written (data sheet: erased bytes read 0xFF).
 constexpr uint8_t BLANK = 0xFF;
-// Bytes of the CRC at a record's end.
-constexpr uint8_t CRC_BYTES = 2;
 
 uint8_t *bytes_of(Record *record) { return reinterpret_cast<uint8_t *>(record); }
-
-// size: of the record, its CRC included.
-Crc16 crc_of(Record *record, uint8_t size) {
-    Crc16 crc;
-    for (uint8_t i = 0; i < size - CRC_BYTES; i++)
-        crc.add(bytes_of(record)[i]);
-    return crc;
-}
 
 // Older records are read as well, and never written. Each is the beginning of the record of now,
 // with its CRC behind it; but in place of an accuracy, they have the AVR's prescaler, 32, 64 or
@@ -55,8 +45,7 @@ bool read(uint8_t at, Record *record) {
     const uint8_t size = has_region ? sizeof *record
                                     : static_cast<uint8_t>(offsetof(Record, row_mask) + CRC_BYTES -
                                                            (has_mode ? 0 : sizeof record->mode));
-    const Crc16 crc = crc_of(record, size);
-    const bool sound = bytes[size - 2] == crc.low() && bytes[size - 1] == crc.high();
+    const bool sound = ends_in_crc(bytes, size);
     if (has_region)
         return sound;
     const uint8_t near = static_cast<uint8_t>(frames::Mode::Near);
@@ -158,7 +147,7 @@ void SettingsWriter::begin(const Settings &settings) {
     at_ = second ? SECOND_AT : FIRST_AT;
     left_ = sizeof record_;
     record_.sequence++;
-    const Crc16 crc = crc_of(&record_, sizeof record_);
+    const Crc16 crc = crc_of(bytes_of(&record_), sizeof record_ - CRC_BYTES);
     record_.crc_low = crc.low();
     record_.crc_high = crc.high();
 }
