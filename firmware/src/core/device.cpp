@@ -335,7 +335,8 @@ void Device::save() {
 }
 
 Result Device::load_defaults() {
-    const Settings defaults = default_settings();
+    Settings defaults;
+    take_defaults(&defaults);
     if (configure(defaults.request) != Result::Ok)
         return Result::LineTooSlow;
     settings_ = defaults;

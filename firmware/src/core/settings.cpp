@@ -35,6 +35,9 @@ bool known(uint8_t version) {
     return version >= VERSION_WITHOUT_MODE && version <= Record::VERSION;
 }
 
+// All of so many rows or columns.
+OHMSKIN_RARE uint32_t mask_of(uint8_t lines) { return (uint32_t{1} << lines % 32) - 1; }
+
 // Reads a record; false where its CRC is wrong.
 bool read(uint8_t at, Record *record) {
     uint8_t *bytes = bytes_of(record);
@@ -56,8 +59,8 @@ bool read(uint8_t at, Record *record) {
            record->accuracy != 32 << accuracy)
         accuracy++;
     record->accuracy = accuracy;
-    record->row_mask = (uint32_t{1} << record->rows % 32) - 1;
-    record->column_mask = (uint32_t{1} << record->columns % 32) - 1;
+    record->row_mask = mask_of(record->rows);
+    record->column_mask = mask_of(record->columns);
     record->whole_mode = near;
     record->whole_every = 0;
     return sound;
@@ -96,10 +99,9 @@ bool foreign(uint8_t at) {
 }  // namespace
 
 // By assignments: of a constant object, an AVR would have a copy in RAM.
-Settings default_settings() {
-    Settings settings;
-    ScanRequest &scan = settings.request;
-    settings.unit_id = 0;  // none yet
+void take_defaults(Settings *settings) {
+    ScanRequest &scan = settings->request;
+    settings->unit_id = 0;  // none yet
     // Chosen: the size of skin that docs/ reckons with.
     scan.rows = scan.columns = 8;
     scan.row_mask = scan.column_mask = 0xFF;
@@ -109,11 +111,10 @@ Settings default_settings() {
     scan.settle_us = 0;  // as long as the rate allows
     scan.mode = scan.whole_mode = static_cast<uint8_t>(frames::Mode::Near);
     scan.whole_every = 0;  // no whole scans in between: all are whole
-    return settings;
 }
 
 frames::Settings load_settings(Settings *settings, uint16_t cycles_per_byte, Routes *routes) {
-    *settings = default_settings();
+    take_defaults(settings);
     Record record;
     if (read_newest(&record) == NOWHERE && !read(OLD_AT, &record))
         return all_blank() ? frames::Settings::DefaultsBlank : frames::Settings::DefaultsDamaged;
@@ -132,10 +133,21 @@ void SettingsWriter::begin(const Settings &settings) {
     Record last = {};
     const uint8_t newest = read_newest(&last);
     const ScanRequest &scan = settings.request;
-    // The sequence and the CRC of the last record, for the comparison below.
-    record_ = {Record::VERSION,  last.sequence,   settings.unit_id, scan.rows,    scan.columns,
-               scan.rate_mhz,    scan.settle_us,  scan.accuracy,    scan.mode,    scan.row_mask,
-               scan.column_mask, scan.whole_mode, scan.whole_every, last.crc_low, last.crc_high};
+    // With the sequence and the CRC of the last record, for the comparison below. Field by field:
+    // an initializer would be made on the stack first.
+    record_ = last;
+    record_.version = Record::VERSION;
+    record_.unit_id = settings.unit_id;
+    record_.rows = scan.rows;
+    record_.columns = scan.columns;
+    record_.rate_mhz = scan.rate_mhz;
+    record_.settle_us = scan.settle_us;
+    record_.accuracy = scan.accuracy;
+    record_.mode = scan.mode;
+    record_.row_mask = scan.row_mask;
+    record_.column_mask = scan.column_mask;
+    record_.whole_mode = scan.whole_mode;
+    record_.whole_every = scan.whole_every;
     state_ = State::Writing;
     at_ = newest;
     left_ = 0;

@@ -12,9 +12,10 @@ struct Settings {
     ScanRequest request;
 };
 
-// How a board scans that nobody has configured. These numbers are the firmware's own. The protocol
-// says what may be asked for, not what a board begins with, and hosts read that from `hello`.
-OHMSKIN_RARE Settings default_settings();
+// Sets them to those of a board that nobody has configured. These numbers are the firmware's own.
+// The protocol says what may be asked for, not what a board begins with, and hosts read that from
+// `hello`. They are not returned, which would take a copy.
+OHMSKIN_RARE void take_defaults(Settings *settings);
 
 // Settings as the EEPROM holds them. The fields are the record's own, not the protocol's, so that a
 // change of the protocol forgets nothing. A change of the fields needs a new VERSION; `version` and

@@ -46,6 +46,12 @@ template <size_t SIZE> void put(uint8_t at, const uint8_t (&record)[SIZE]) {
     memcpy(fake::state.eeprom + at, record, SIZE);
 }
 
+Settings defaults() {
+    Settings settings;
+    take_defaults(&settings);
+    return settings;
+}
+
 bool same(const Settings &a, const Settings &b) {
     return a.unit_id == b.unit_id && memcmp(&a.request, &b.request, sizeof a.request) == 0;
 }
@@ -129,7 +135,7 @@ TEST(a_save_cut_at_any_byte_leaves_the_old_settings_or_the_new) {
                 Source source;
                 const Settings after = loaded(&source);
                 CHECK(same(after, old) || same(after, THREE));
-                CHECK(source == Source::Stored || (start == 0 && same(after, default_settings())));
+                CHECK(source == Source::Stored || (start == 0 && same(after, defaults())));
                 if (done) {
                     CHECK(same(after, THREE));
                     break;
@@ -207,7 +213,7 @@ TEST(a_record_of_another_version_is_ignored_and_kept) {
         fake::reset();
         put(at, OF_LATER_VERSION);
         Source source;
-        CHECK(same(default_settings(), loaded(&source)));
+        CHECK(same(defaults(), loaded(&source)));
         CHECK_EQ(Source::DefaultsDamaged, source);
         CHECK_EQ(State::Done, save(ONE));
         CHECK_BYTES(OF_LATER_VERSION, fake::state.eeprom + at, sizeof OF_LATER_VERSION);
@@ -223,7 +229,7 @@ TEST(the_unit_id_outlives_a_scan_that_this_firmware_cannot_make) {
     put(32, IMPOSSIBLE);
     Source source;
     const Settings settings = loaded(&source);
-    Settings expected = default_settings();
+    Settings expected = defaults();
     expected.unit_id = 77;
     CHECK(same(expected, settings));
     CHECK_EQ(Source::DefaultsDamaged, source);
