@@ -211,13 +211,13 @@ Result plan_scan(const ScanRequest &request, uint16_t cycles_per_byte, Routes *r
     Planner planner(cycles_per_byte, request.accuracy, idle_min);
     Routes found;
     found.whole_every = request.whole_every;
-    found.whole =
-        Route{all_lines(request.rows), all_lines(request.columns), request.whole_mode, {}, 0};
-    found.region = Route{static_cast<LineMask>(request.row_mask),
-                         static_cast<LineMask>(request.column_mask),
-                         request.mode,
-                         {},
-                         0};
+    // Field by field: an initializer would clear plans first.
+    found.whole.rows = all_lines(request.rows);
+    found.whole.columns = all_lines(request.columns);
+    found.whole.pattern = request.whole_mode;
+    found.region.rows = static_cast<LineMask>(request.row_mask);
+    found.region.columns = static_cast<LineMask>(request.column_mask);
+    found.region.pattern = request.mode;
     Result result = planner.plan(&found.whole, 0, 0);
     if (result == Result::Ok || request.whole_every == 0)
         result = planner.plan(&found.region, request.rate_mhz, request.settle_us);
