@@ -10,6 +10,7 @@
 
 #include "avr_pins.h"
 #include "board.h"
+#include "core/attributes.h"
 #include "core/reset_cause.h"
 
 namespace ohmskin {
@@ -178,13 +179,10 @@ constexpr uint16_t interrupt_at(uint8_t prescaler) {
                                  PINS_AFTER_INTERRUPT);
 }
 
-// A prescaler as the converter's register has it: its logarithm to the base 2.
-uint8_t prescaler_bits(uint8_t prescaler) {
-    uint8_t bits = 0;
-    while (prescaler >>= 1)
-        bits++;
-    return bits;
-}
+// The prescaler as the converter's register has it: its logarithm to the base 2.
+constexpr uint8_t prescaler_bits(uint8_t accuracy) { return static_cast<uint8_t>(5 + accuracy); }
+static_assert(prescaler(0) == 1 << prescaler_bits(0) && prescaler(2) == 1 << prescaler_bits(2),
+              "of all accuracies");
 
 // Sets pins and multiplexers, and the converter's channel for its next sample.
 inline void select(const Selection &selection) {
@@ -213,14 +211,13 @@ ISR(TIMER1_COMPA_vect) {
 
 void start_slots(uint16_t slot_cycles, uint8_t accuracy) {
     const uint8_t adc_prescaler = prescaler(accuracy);
-    const uint8_t bits = prescaler_bits(adc_prescaler);
     select(scanner.selection());
     // The timer stands still until all is set, and its flags are cleared: a flag from before would
     // start a conversion at once.
     TCCR1B = 0;
     TIFR1 = _BV(OCF1A) | _BV(OCF1B);
     ADCSRB = _BV(ADTS2) | _BV(ADTS0);  // auto trigger by timer 1, compare B
-    ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | bits);
+    ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADATE) | _BV(ADIF) | prescaler_bits(accuracy));
     TCCR1A = 0;
     // The mode in which the counter starts again after ICR1, which can be written in this mode
     // only.
@@ -276,8 +273,8 @@ void converter_begin() {
     ADMUX = REGISTERS[0].admux;
     // The first conversion after switching on takes 25 ADC clocks, for which a slot has no room. So
     // it is made now, and nobody reads it.
-    constexpr uint8_t PRESCALER = prescaler(static_cast<uint8_t>(frames::Accuracy::Usual));
-    ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADSC) | prescaler_bits(PRESCALER));
+    constexpr uint8_t USUAL = static_cast<uint8_t>(frames::Accuracy::Usual);
+    ADCSRA = static_cast<uint8_t>(_BV(ADEN) | _BV(ADSC) | prescaler_bits(USUAL));
     while (ADCSRA & _BV(ADSC)) {
     }
 }
@@ -336,7 +333,7 @@ bool serial_speed_known(uint32_t baud) {
     return baud == frames::BAUD_DEFAULT || baud == frames::BAUD_FAST;
 }
 
-void serial_speed(uint32_t baud) {
+OHMSKIN_RARE void serial_speed(uint32_t baud) {
     UCSR0B = 0;
     UCSR0A = _BV(U2X0);  // the clock is divided by 8, not 16
     UBRR0 = static_cast<uint16_t>(CLOCK_HZ / 8 / baud - 1);
