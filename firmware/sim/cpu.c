@@ -252,6 +252,9 @@ void cpu_run_until(instant target) {
         if (!cpu_alive())
             return;
     }
+    /* simavr enters an interrupt after the events of an instruction. What is due while it does so
+     * has happened when the run ends: the host may change the skin next. */
+    events_until(cpu->cycle);
 }
 
 static void log_errors(struct avr_t *avr, const int level, const char *format, va_list arguments) {

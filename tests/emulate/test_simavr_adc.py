@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from avr import BOARDS, FOREVER, ICR1, TCCR1B, Simulate, sts, sts_word
 from lockstep import CPU_HZ, LockstepSim
 
-ADCSRA, ADCSRB, ADMUX, OCR1B = 0x7A, 0x7B, 0x7C, 0x8A
+ADCSRA, ADCSRB, ADMUX, OCR1A, OCR1B, TIMSK1 = 0x7A, 0x7B, 0x7C, 0x88, 0x8A, 0x6F
 CLEAR_OCF1B_FOREVER = "1: sbi 0x16, 2\n rjmp 1b\n"
 # The ADC runs freely and holds at 470, 886, ...; at 9.
 FREE_RUNNING = sts(ADMUX, 0x40) + sts(ADCSRA, 0xA5) + sts(ADCSRA, 0xE5)
@@ -172,6 +172,28 @@ def test_codes_of_every_cell_and_configuration(simulate: Simulate, board: str) -
     codes = np.frombuffer(sim.run(0.1), "<u2").reshape(16, 16, 4)
     assert list(codes[1, 1]) == [512] * 4
     assert list(codes[2, 0]) == [1023, 0, 1023, 0]
+
+
+@pytest.mark.parametrize("early", range(8))
+def test_a_hold_while_an_interrupt_begins_comes_before_the_end_of_the_run(
+    simulate: Simulate, early: int
+) -> None:
+    """A run may end just as the processor has entered an interrupt, which takes four cycles."""
+    program = "rjmp 2f\n .org 0x2C\n reti\n 2:\n"  # timer 1, compare A
+    program += "ldi r16, 15\n out 0x04, r16\n ldi r16, 0xFC\n out 0x0A, r16\n"
+    program += "ldi r16, 0x04\n out 0x0B, r16\n"  # configuration A, row 0
+    program += sts_word(OCR1A, 75 - early) + sts(TIMSK1, 2) + "sei\n"
+    sim = simulate(program + triggered(top=499, compare=8) + CLEAR_OCF1B_FOREVER)
+    last = hold_cycles(sim, 2000)[-1]
+    sim.run_cycles(last + 500 - 10 - int(sim.stats()["cycles"]))
+    changes = []
+    for code in range(20):
+        sim.set_table(np.full((2, 2, 4), code / 1024))
+        changes.append(sim.stats()["cycles"])
+        sim.run_cycles(1)
+    (hold,) = sim.drain_hold_log()
+    assert hold["cycle"] == last + 500
+    assert hold["code"] == np.searchsorted(changes, hold["cycle"]) - 1
 
 
 @pytest.mark.parametrize(("adps", "offset"), [(5, 1.5), (7, -2.0)])
