@@ -261,7 +261,7 @@ __attribute__((naked, used, section(".init3"))) void take_loader_status() {
 }
 
 void clock_begin() {
-    TIMSK0 = 0;  // the Arduino core counts milliseconds in this interrupt
+    TIMSK0 = 0;  // no interrupt, whatever ran before
     TCCR0A = 0;
     TCCR0B = _BV(CS01) | _BV(CS00);  // clock / 64
     TCNT0 = 0;
