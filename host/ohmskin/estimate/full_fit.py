@@ -33,7 +33,7 @@ those of Gauss-Newton in the space of the readings (Tarantola 2005, eq. 3.51),
 
 and the posterior covariance of u is 1 - J^T S^-1 J = 1 - O^T O. To make J, N and S takes most of
 the time. So each step is first tried with those of the step before. They are made anew only if it
-is not the last one (`FullFit._is_last`).
+is not the last one (`FullFit._is_last`). N only weighs readings, so it is kept for longer.
 """
 
 import math
@@ -72,6 +72,8 @@ OLD_LOG: Final = 0.15
 # A step is not the last one if the log of a deviation in J would change by more (`_is_last`).
 # Chosen: then it changes by half as much again.
 FOLLOWS_LOG: Final = 0.4
+# N is made anew if a log resistance may have moved by more since. Chosen: N only weighs readings.
+OLD_NOISE_LOG: Final = 0.5
 # What explains a frame better by less does not count (`FullFit.gains_of_shorts`). Chosen: half of a
 # normal residual gains as much by chance.
 LEAST_PULL: Final = 2.0
@@ -111,6 +113,7 @@ class FullFit:
         self._mean_stds = np.zeros(len(belief.means))  # u of the means
         # The most that a log resistance can have moved since J was made.
         self._moved_log = 0.0
+        self._moved_since_noise = np.inf  # since N was made
         self._evaluate()
         self._minimise()
         self._conclude()
@@ -143,22 +146,17 @@ class FullFit:
     def _linearise(self) -> None:
         """Make J, N and S for the present state."""
         self._moved_log = 0.0
-        by_wires = self._circuit.by_wires()
-        by_layers = by_wires.reshape(len(by_wires), 2, -1).sum(axis=2)
-        direct = [by_layers, self._belief.by_leads(self._means)]
+        direct = [self._circuit.by_layers(), self._belief.by_leads(self._means)]
         if self._belief.has_leaks:
             direct.append(1e-6 * self._circuit.by_leaks())  # by uS
         if self._belief.learns_segments:
-            direct.append(by_wires)
+            direct.append(self._circuit.by_wires())
         self._by_cell = self._weighted(self._circuit.by_cell())
         # Cells at rest follow the means of the wires.
         by_rest = self._by_cell @ self._prior.by_means
         self._by_mean = self._weighted(np.hstack(direct)) + by_rest
-        own_std, self._by_segment = self._belief.unlearned_std, self._weighted(by_wires)
-        self._noise = np.zeros((self._weight.size,) * 2, order="F")  # N
-        if own_std:
-            self._noise = own_std**2 * gram(self._by_segment)
-        np.einsum("ii->i", self._noise)[:] += 1.0
+        if self._moved_since_noise > OLD_NOISE_LOG:
+            self._make_noise()
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
         self._cell_std = np.sqrt(self._variance)
         cells = self._cell_std.size
@@ -166,6 +164,15 @@ class FullFit:
         np.multiply(self._by_cell, self._cell_std, out=slopes[:, :cells])
         slopes[:, cells:] = self._per_mean_std
         self._factor = cholesky(gram(slopes, onto=self._noise.copy(order="F")))  # L
+
+    def _make_noise(self) -> None:
+        """Make N, and W without s, for the present state."""
+        self._moved_since_noise = 0.0
+        self._by_segment = self._weighted(self._circuit.by_wires())
+        self._noise = np.zeros((self._weight.size,) * 2, order="F")
+        if own_std := self._belief.unlearned_std:
+            self._noise = own_std**2 * gram(self._by_segment)
+        np.einsum("ii->i", self._noise)[:] += 1.0
 
     def _minimise(self) -> None:
         """Take steps until one leaves out next to nothing (`_is_last`).
@@ -237,6 +244,7 @@ class FullFit:
         most = max(np.abs(logs_step).max(), np.abs(means_step[:2]).max(), 1e-9)
         share = min(1.0, MAX_STEP_LOG / most)
         self._moved_log += share * most
+        self._moved_since_noise += share * most
         self.log_cells = self.log_cells + share * logs_step
         self._mean_stds = self._mean_stds + share * stds_step
 
