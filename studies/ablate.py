@@ -58,7 +58,7 @@ OFF: Final[dict[str, float]] = {
     "prior.HIDDEN_LOG": np.inf,
     "prior.UNKNOWN_LAYER_STD": 1e-3,
     "prior.LAYER_STD": 1e-3,
-    "prior.SEGMENT_STD": 0.0,
+    "prior.SEGMENT_STD": 1e-3,
     "prior.CLEAR_LOG": np.inf,
     "prior.STEADY_FADE": 0.0,
     "prior.CHANGED_ODDS": 1e-9,
