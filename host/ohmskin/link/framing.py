@@ -86,11 +86,13 @@ def cobs_encode(content: bytes) -> bytes:
     out = bytearray()
     step = MAX_BLOCK_BYTES - 1
     for run in content.split(protocol.DELIMITER):
-        *full, last = (run[at : at + step] for at in range(0, len(run) + 1, step))
-        for block in full:
-            out += bytes([MAX_BLOCK_BYTES]) + block
-        out += bytes([len(last) + 1]) + last
-    if full and not last:
+        while len(run) >= step:
+            out.append(MAX_BLOCK_BYTES)
+            out += run[:step]
+            run = run[step:]
+        out.append(len(run) + 1)
+        out += run
+    if not run and content[-1:] not in (b"", protocol.DELIMITER):
         out.pop()  # an empty block is written only where a zero stood, and none stands at the end
     return bytes(out)
 

@@ -17,7 +17,7 @@ import struct
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -328,16 +328,18 @@ def pack_codes(codes: NDArray[np.uint16], per_pass: int = 2, bits: int = ADC_BIT
     return np.packbits(in_bits, bitorder="little").tobytes()
 
 
+@lru_cache
 def all_lines(count: int) -> int:
     """The mask of the first `count` rows or columns, of as many as a mask has bits for."""
     return (1 << min(count, CONSTANTS["rows_max"])) - 1
 
 
-def lines_of(mask: int, count: int) -> list[int]:
+@lru_cache
+def lines_of(mask: int, count: int) -> tuple[int, ...]:
     """The numbers of the rows or columns that are in a mask, rising; there are `count` of them.
 
     :raises ValueError: others are in it.
     """
     if mask > all_lines(count):
         raise ValueError(f"a mask has lines beyond the {count} that there are")
-    return [line for line in range(mask.bit_length()) if mask >> line & 1]
+    return tuple(line for line in range(mask.bit_length()) if mask >> line & 1)
