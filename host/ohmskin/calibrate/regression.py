@@ -303,8 +303,9 @@ class _Trial:
         coefficients = 2 if curve.is_power else 1
         # Numbers are those of the module's list. 1: in s^2 times Student's factor, n - p cancels.
         freedom = rows.x.size - coefficients
-        square = float(np.sum((rows.force - force_by(curve, rows.x)) ** 2 / v)) / (freedom - 2)
-        by_rise = float(np.mean(spread(curve, rows.x, rows.dx) ** 2 / v))  # 2
+        predicted, off = spread(curve, rows.x, rows.dx)
+        square = float(np.sum((rows.force - predicted) ** 2 / v)) / (freedom - 2)
+        by_rise = float(np.mean(off**2 / v))  # 2
         s = float(np.sqrt(max(square - by_rise, 0.0)))
         error = self._errors.get((curve.kind, grows), np.full_like(v, np.nan))
         held_out_s = _rms(error / np.sqrt(v))

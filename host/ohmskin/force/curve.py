@@ -117,20 +117,16 @@ class ForceModel:
                 raise ValueError(f"{name} has shape {array.shape}, this calibration {shape}")
         require("rise", np.isfinite(x), "not finite")
         require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
-        by_rise = spread(self, x, np.nan_to_num(dx))  # where dx is NaN, so is the answer, below
-        above = np.maximum(x, 0.0)
-        logarithm = np.log(np.where(above > 0, above, 1.0))
-        powered = above**self.exponent
-        by_slope = np.where(self.is_power, powered, x) * self.slope_std
-        by_exponent = self.slope * powered * logarithm * self.exponent_std
+        uncut_n, by_rise = spread(self, x, dx)  # where dx is NaN, so is the second, and the answer
+        by_slope = uncut_n * (self.slope_std / self.slope)
+        by_exponent = uncut_n * np.log(np.where(x > 0, x, 1.0)) * self.exponent_std
         # J K J^T; the exponent of a linear cell has no error. The slope of a power law is the force
         # at 1 S, far from any press. So where its error is large, the error of the exponent is
         # large as well, and both nearly cancel. Then rounding may leave less than 0.
         by_fit = by_slope**2 + by_exponent**2 + 2 * self.correlation * by_slope * by_exponent
-        reported_n = self.slope * powered  # of a linear cell, b is 1
-        scatter = self.residual_std**2 + (self.residual_share * reported_n) ** 2
-        variance = by_rise**2 + scatter + np.maximum(by_fit, 0.0)
-        return reported_n, np.sqrt(np.where(np.isnan(dx), np.nan, variance))
+        force_n = np.maximum(uncut_n, 0.0)
+        scatter = self.residual_std**2 + (self.residual_share * force_n) ** 2
+        return force_n, np.sqrt(by_rise**2 + scatter + np.maximum(by_fit, 0.0))
 
     def rise(self, force_n: ArrayLike) -> Float:
         """The rise x above rest, (R, C), at which a force [N] is predicted: x = (F / a)^(1 / b).
@@ -170,10 +166,10 @@ def force_by(curve: ForceModel | Curve, x: Float) -> Float:
     return np.where(curve.is_power, power, curve.slope * x)
 
 
-def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> Float:
-    """d of the module's equations [N]: how far the force is off if x is off by dx."""
-    here = force_by(curve, x)
-    return np.maximum(force_by(curve, x + dx) - here, here - force_by(curve, x - dx))
+def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> tuple[Float, Float]:
+    """`force_by`, and d of the module's equations [N]: how far F is off if x is off by dx."""
+    here, more, less = force_by(curve, np.array([x, x + dx, x - dx]))
+    return here, np.maximum(more - here, here - less)
 
 
 def require(name: str, good: Bool, what: str) -> None:
