@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -337,6 +337,19 @@ class SkinReader:
         :raises CommandRefused: as `Focus.follow`, where `focus` is set.
         :raises DeviceLost: as `Focus.follow`, where `focus` is set.
         """
+        return self._shown(scan, *self._estimated(scan))
+
+    def read_all(self, scans: Sequence[Scan]) -> list[ForceScan]:
+        """`read` of scan after scan, in less time: first all estimates, then all that follows.
+
+        A processor keeps the code of either at hand, but not that of both in turn. Raises what
+        `read` does.
+        """
+        estimated = [self._estimated(scan) for scan in scans]
+        return [self._shown(scan, *of_scan) for scan, of_scan in zip(scans, estimated, strict=True)]
+
+    def _estimated(self, scan: Scan) -> tuple[Estimate, Float, Calibration | None]:
+        """The estimate, its rise above rest (R, C), and what gives newtons for it, if anything."""
         self.check_mode(scan.mode)
         if scan.rest_ratio is not None:
             self._shared.take_recorded(scan.rest_ratio)
@@ -346,15 +359,21 @@ class SkinReader:
         self._shared.hear(self._estimator)
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
         at_rest = np.median(estimate.level) if self._rest_level is None else self._rest_level
-        rise = np.asarray(estimate.level - at_rest)
-        force_n = force_n_std = np.full(rise.shape, np.nan)
-        # Without newtons, the rise takes the place of the force in sums and centres of contacts.
-        of_contacts = np.maximum(rise, 0.0), estimate.level_std
-        calibration, geometry = self._shared.calibration, None
-        if calibration is not None and self.has_forces:
+        calibration = self._shared.calibration if self.has_forces else None
+        return estimate, np.asarray(estimate.level - at_rest), calibration
+
+    def _shown(
+        self, scan: Scan, estimate: Estimate, rise: Float, calibration: Calibration | None
+    ) -> ForceScan:
+        geometry: Geometry | None = None
+        if calibration is not None:
             geometry = calibration.geometry
             force_n, force_n_std = calibration.forces(rise, estimate.level_std, estimate.touched)
             of_contacts = force_n, force_n_std
+        else:
+            force_n = force_n_std = np.full(rise.shape, np.nan)
+            # The rise takes the place of the force in sums and centres of contacts.
+            of_contacts = np.maximum(rise, 0.0), estimate.level_std
         contacts = self._tracker.update(scan.time_us, estimate.touched, *of_contacts)
         if geometry is not None:
             contacts = tuple(geometry.placed(contact, force_n) for contact in contacts)

@@ -21,7 +21,7 @@ the marks in the file's metadata. Files are written scan by scan: hours need no 
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
@@ -34,6 +34,7 @@ from ohmskin.files import PathName, save_table, whole_file
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.contacts import Contact
 from ohmskin.force.reader import ForceScan, SkinReader
+from ohmskin.link.messages import Scan
 from ohmskin.record.export import FORMATS as OF_READINGS
 from ohmskin.record.export import Part, Stacks, save_readings
 
@@ -41,6 +42,8 @@ FORMATS: Final = (*OF_READINGS, ".parquet")
 _OF_SCAN: Final = ("number", "missed", "time_ns")
 _OF_CELLS: Final = ("force_n", "force_n_std")
 _OF_CONTACT: Final = ("row", "column", "force_n", "force_n_std")
+# So many scans are read at once. Chosen: with more, `SkinReader.read_all` takes as long.
+_READ_SCANS: Final = 64
 # A group of rows in a .parquet has so many scans. Chosen: programs read whole groups, and these are
 # 1 MB of an 8x8 skin.
 _GROUP_SCANS: Final = 2048
@@ -97,15 +100,23 @@ def export(
 
 def read_forces(part: Part, calibration: Calibration) -> Iterator[ForceScan]:
     """The scans of a part of a recording with their forces, each with the tare before it."""
-    reader: SkinReader | None = None
+    scans = _tared(part)
+    first = next(scans)
+    reader = SkinReader(part.boards[-1], calibration)
+    scans = chain([first], scans)
+    while group := list(islice(scans, _READ_SCANS)):
+        yield from reader.read_all(group)
+
+
+def _tared(part: Part) -> Iterator[Scan]:
+    """The scans, each with the tare before it, as long as they are of one unit."""
     for scan in part:
-        board = part.boards[-1]
-        reader = reader or SkinReader(board, calibration)
-        if board.unit_id != reader.board.unit_id:
-            came = f"unit {board.unit_id} has come in place of unit {reader.board.unit_id}"
+        unit_id, first_id = part.boards[-1].unit_id, part.boards[0].unit_id
+        if unit_id != first_id:
+            came = f"unit {unit_id} has come in place of unit {first_id}"
             raise part.error(f"{came}: export each part by its own calibration")
         tare = part.tare_of(scan)
-        yield reader.read(scan if tare is None else replace(scan, rest_ratio=tare.rest_ratio))
+        yield scan if tare is None else replace(scan, rest_ratio=tare.rest_ratio)
 
 
 def _stacks(calibration: Calibration, folder: Path | None) -> Stacks:
