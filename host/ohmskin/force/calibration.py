@@ -209,9 +209,9 @@ class Calibration:
             raise ValueError(f"this calibration is of {units}: {remedy}")
 
     def forces(self, rise: Float, rise_std: Float, touched: Bool) -> tuple[Float, Float]:
-        """Force and its standard deviation [N], (R, C), of what cells show.
+        """Force and its standard deviation [N], (..., R, C), of what cells show, in any scans.
 
-        rise, rise_std: above rest, (R, C) [S; 1 for `voltage`]; touched: which cells are, (R, C).
+        rise, rise_std: above rest, (..., R, C) [S; 1 for `voltage`]; touched: which cells are.
 
         They are `model.predict`, F with deviation s. But behind wires that resist much more than a
         cell, readings may allow any hard touch. So where s of a touched cell is above the largest

@@ -19,8 +19,9 @@ MEMORY_US: Final = 100_000
 # Contacts that were in the scan before are remembered for this longer time [us]. Chosen: a board
 # may scan only once a second (rate_mhz_min of frames.toml), and one scan may be lost.
 SLOWEST_SCAN_US: Final = 20 * MEMORY_US
-# Which neighbours adjoin, for scipy: those along an edge or at a corner.
-_EIGHT_NEIGHBOURS: Final = np.ones((3, 3), dtype=np.int_)
+# Which neighbours adjoin, for scipy: those along an edge or at a corner, in the same scan.
+_EIGHT_NEIGHBOURS: Final = np.zeros((3, 3, 3), dtype=np.int_)
+_EIGHT_NEIGHBOURS[1] = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,19 +80,23 @@ class ContactTracker:
         self, time_us: int, touched: Bool, force_n: Float, force_n_std: Float
     ) -> tuple[Contact, ...]:
         """The contacts of a scan, the oldest first. Arrays (R, C); time_us: the board's."""
+        return self.follow(time_us, found(touched[None], force_n[None], force_n_std[None])[0])
+
+    def follow(self, time_us: int, contacts: list[Contact]) -> tuple[Contact, ...]:
+        """These contacts of a scan with their numbers, the oldest first. time_us: the board's."""
         for identity, (_, last_us) in list(self._remembered.items()):
             longest_us = SLOWEST_SCAN_US if last_us == self._before_us else MEMORY_US
             # The board's time goes back when the board is reset: then nothing is remembered.
             if not 0 <= time_us - last_us <= longest_us:
                 del self._remembered[identity]
         self._before_us = time_us
-        contacts = _unnumbered(touched, force_n, force_n_std)
         identities = _identities(contacts, [contact for contact, _ in self._remembered.values()])
-        for index, contact in enumerate(contacts):
-            identity = identities.get(index) or next(self._new_identities)
-            contacts[index] = replace(contact, identity=identity)
-        self._remembered |= {contact.identity: (contact, time_us) for contact in contacts}
-        return tuple(sorted(contacts, key=lambda contact: contact.identity))
+        numbered = [
+            replace(contact, identity=identities.get(index) or next(self._new_identities))
+            for index, contact in enumerate(contacts)
+        ]
+        self._remembered |= {contact.identity: (contact, time_us) for contact in numbered}
+        return tuple(sorted(numbered, key=lambda contact: contact.identity))
 
 
 def _identities(now: list[Contact], before: list[Contact]) -> dict[int, int]:
@@ -100,8 +105,11 @@ def _identities(now: list[Contact], before: list[Contact]) -> dict[int, int]:
 
     if not now or not before:
         return {}
-    centres, were = (np.array([(c.row, c.column) for c in contacts]) for contacts in (now, before))
-    away = np.hypot(*(centres[:, None] - were[None]).transpose(2, 0, 1))
+    # Centres as complex numbers, whose differences have the distances as their absolute values.
+    centres, were = (
+        np.array([complex(c.row, c.column) for c in contacts]) for contacts in (now, before)
+    )
+    away = np.abs(centres[:, None] - were)
     too_far = away > FARTHEST_CELLS
     # A pair that is too far apart costs more than all others together. So as few of them as
     # possible are made, and these are left out below.
@@ -110,18 +118,27 @@ def _identities(now: list[Contact], before: list[Contact]) -> dict[int, int]:
     return {one: before[other].identity for one, other in pairs if not too_far[one, other]}
 
 
-def _unnumbered(touched: Bool, force_n: Float, force_n_std: Float) -> list[Contact]:
-    """The contacts of a scan, with the identity 0."""
+def found(touched: Bool, force_n: Float, force_n_std: Float) -> list[list[Contact]]:
+    """The contacts of each of n scans, with the identity 0. Arrays (n, R, C)."""
     from scipy.ndimage import label
 
-    labels, number_of_contacts = label(touched, structure=_EIGHT_NEIGHBOURS)
-    contacts = []
-    for number in range(1, number_of_contacts + 1):
-        cells = labels == number
-        places, of_cells_n = np.nonzero(cells), force_n[cells]
-        total_n, std_n = float(of_cells_n.sum()), float(force_n_std[cells].sum())
-        # A touch that is too light for its curve has no force: then all its cells count alike.
-        weights = of_cells_n if total_n > 0 else np.ones_like(of_cells_n)
-        row, column = (float(np.dot(weights, place) / weights.sum()) for place in places)
-        contacts.append(Contact(0, row, column, total_n, std_n, cells))
+    labels, count = label(touched, structure=_EIGHT_NEIGHBOURS)
+    places = np.nonzero(labels)
+    of = labels[places] - 1  # which contact each touched cell is of
+
+    def sums(values: Float) -> Float:
+        """Of each contact."""
+        return np.asarray(np.bincount(of, values, count), dtype=np.float64)
+
+    of_cells_n = force_n[places]
+    total_n, std_n = sums(of_cells_n), sums(force_n_std[places])
+    # A touch that is too light for its curve has no force: then all its cells count alike.
+    weights = np.where(total_n[of] > 0, of_cells_n, 1.0)
+    rows, columns = (sums(weights * place) / sums(weights) for place in places[1:])
+    scans = np.zeros(count, dtype=np.intp)
+    scans[of] = places[0]
+    contacts: list[list[Contact]] = [[] for _ in touched]
+    of_contacts = (values.tolist() for values in (scans, rows, columns, total_n, std_n))
+    for k, (scan, row, column, of_contact_n, std) in enumerate(zip(*of_contacts, strict=True)):
+        contacts[scan].append(Contact(0, row, column, of_contact_n, std, labels[scan] == k + 1))
     return contacts

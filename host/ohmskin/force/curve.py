@@ -104,7 +104,7 @@ class ForceModel:
         return np.asarray(self.kind == POWER)
 
     def predict(self, rise: ArrayLike, rise_std: ArrayLike) -> tuple[Float, Float]:
-        """Force and its standard deviation [N], each (R, C), of rises above rest (R, C).
+        """Force and its standard deviation [N], each (..., R, C), of rises above rest (..., R, C).
 
         No force is below 0; the standard deviation is that before the cut. It is NaN where
         `rise_std` is (the method gives none), and where the scatter is unknown. Raises ValueError,
@@ -113,7 +113,7 @@ class ForceModel:
         x, dx = np.asarray(rise, dtype=np.float64), np.asarray(rise_std, dtype=np.float64)
         shape = self.kind.shape
         for name, array in (("rise", x), ("rise_std", dx)):
-            if array.shape != shape:
+            if array.shape[-2:] != shape:
                 raise ValueError(f"{name} has shape {array.shape}, this calibration {shape}")
         require("rise", np.isfinite(x), "not finite")
         require("rise_std", ~(dx < 0) & ~np.isinf(dx), "negative or inf")
@@ -173,10 +173,10 @@ def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> tuple[Float, Float
 
 
 def require(name: str, good: Bool, what: str) -> None:
-    """Raise ValueError, naming the first cell, unless all are good, (R, C).
+    """Raise ValueError, naming the first cell, unless all are good, (..., R, C).
 
     what: the error says that the cell is this.
     """
     if not good.all():
-        row, column = (int(index) for index in np.argwhere(~good)[0])
+        row, column = (int(index) for index in np.argwhere(~good)[0, -2:])
         raise ValueError(f"{name} of cell ({row}, {column}) is {what}")

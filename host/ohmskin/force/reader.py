@@ -28,7 +28,7 @@ from ohmskin.estimate.knowledge import NO_WIRES, REF_LOG_STD, SkinKnowledge
 from ohmskin.estimate.methods import kind_of, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
-from ohmskin.force.contacts import Contact, ContactTracker
+from ohmskin.force.contacts import Contact, ContactTracker, found
 from ohmskin.force.focus import FOLLOWING, Focus
 from ohmskin.force.geometry import Geometry
 from ohmskin.link.codes import quantise
@@ -337,44 +337,57 @@ class SkinReader:
         :raises CommandRefused: as `Focus.follow`, where `focus` is set.
         :raises DeviceLost: as `Focus.follow`, where `focus` is set.
         """
-        return self._shown(scan, *self._estimated(scan))
+        return self.read_all([scan])[0]
 
     def read_all(self, scans: Sequence[Scan]) -> list[ForceScan]:
-        """`read` of scan after scan, in less time: first all estimates, then all that follows.
+        """`read` of scan after scan by one method, in less time than one by one.
 
-        A processor keeps the code of either at hand, but not that of both in turn. Raises what
-        `read` does.
+        First come all estimates, then all that follows, in few steps for all scans together: a
+        processor keeps the code of either at hand, but not that of both in turn. Raises what `read`
+        does.
         """
-        estimated = [self._estimated(scan) for scan in scans]
-        return [self._shown(scan, *of_scan) for scan, of_scan in zip(scans, estimated, strict=True)]
+        method = self._wanted
+        pairs = [self._estimated(scan, method) for scan in scans]
+        estimates = [estimate for estimate, _ in pairs]
+        rises = np.array([rise for _, rise in pairs])
+        stds, touched = (
+            np.array([getattr(estimate, name) for estimate in estimates])
+            for name in ("level_std", "touched")
+        )
+        calibration, geometry = self._shared.calibration, None
+        if calibration is not None and self.has_forces:
+            geometry = calibration.geometry
+            forces = of_contacts = calibration.forces(rises, stds, touched)
+        else:
+            forces = (np.full(rises.shape, np.nan),) * 2
+            # The rise takes the place of the force in sums and centres of contacts.
+            of_contacts = np.maximum(rises, 0.0), stds
+        of_scans = zip(scans, estimates, *forces, found(touched, *of_contacts), strict=True)
+        return [self._shown(*of_scan, geometry) for of_scan in of_scans]
 
-    def _estimated(self, scan: Scan) -> tuple[Estimate, Float, Calibration | None]:
-        """The estimate, its rise above rest (R, C), and what gives newtons for it, if anything."""
+    def _estimated(self, scan: Scan, method: str) -> tuple[Estimate, Float]:
+        """The estimate by this method, and its rise above rest (R, C)."""
         self.check_mode(scan.mode)
         if scan.rest_ratio is not None:
             self._shared.take_recorded(scan.rest_ratio)
-        if self._made_for != (self._wanted, self.rest):  # rests are compared by identity
-            self._make()
+        if self._made_for != (method, self.rest):  # rests are compared by identity
+            self._make(method)
         estimate = self._estimator.estimate(scan.ratio, scan.reading_names)
         self._shared.hear(self._estimator)
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
         at_rest = np.median(estimate.level) if self._rest_level is None else self._rest_level
-        calibration = self._shared.calibration if self.has_forces else None
-        return estimate, np.asarray(estimate.level - at_rest), calibration
+        return estimate, np.asarray(estimate.level - at_rest)
 
     def _shown(
-        self, scan: Scan, estimate: Estimate, rise: Float, calibration: Calibration | None
+        self,
+        scan: Scan,
+        estimate: Estimate,
+        force_n: Float,
+        force_n_std: Float,
+        unnumbered: list[Contact],
+        geometry: Geometry | None,
     ) -> ForceScan:
-        geometry: Geometry | None = None
-        if calibration is not None:
-            geometry = calibration.geometry
-            force_n, force_n_std = calibration.forces(rise, estimate.level_std, estimate.touched)
-            of_contacts = force_n, force_n_std
-        else:
-            force_n = force_n_std = np.full(rise.shape, np.nan)
-            # The rise takes the place of the force in sums and centres of contacts.
-            of_contacts = np.maximum(rise, 0.0), estimate.level_std
-        contacts = self._tracker.update(scan.time_us, estimate.touched, *of_contacts)
+        contacts = self._tracker.follow(scan.time_us, unnumbered)
         if geometry is not None:
             contacts = tuple(geometry.placed(contact, force_n) for contact in contacts)
         if (focus := self.focus) is not None:
@@ -391,11 +404,11 @@ class SkinReader:
     def _begin(self) -> None:
         """Begin with no contact, and as if no scan had come before."""
         self._tracker = ContactTracker()
-        self._make()
+        self._make(self._wanted)
 
-    def _make(self) -> None:
-        """Make the estimator for the method and the rest that hold now."""
-        method, rest = self._wanted, self.rest
+    def _make(self, method: str) -> None:
+        """Make the estimator for the method and the rest that holds now."""
+        rest = self.rest
         self._estimator = self._shared.estimator(method, rest)
         self._rest_level: Float | None = None  # (R, C) [S; 1 for `voltage`]; None: unknown
         if isinstance(rest, Rest) and method == self.force_method:
