@@ -19,9 +19,11 @@ the marks in the file's metadata. Files are written scan by scan: hours need no 
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import islice
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
@@ -32,16 +34,22 @@ from numpy.typing import NDArray
 from ohmskin.errors import OhmskinError
 from ohmskin.files import PathName, save_table, whole_file
 from ohmskin.force.calibration import Calibration
-from ohmskin.force.contacts import Contact
 from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.messages import Scan
 from ohmskin.record.export import FORMATS as OF_READINGS
 from ohmskin.record.export import Part, Stacks, save_readings
 
 FORMATS: Final = (*OF_READINGS, ".parquet")
-_OF_SCAN: Final = ("number", "missed", "time_ns")
-_OF_CELLS: Final = ("force_n", "force_n_std")
-_OF_CONTACT: Final = ("row", "column", "force_n", "force_n_std")
+# What is told of scans and cells, and of which type it is.
+_OF_SCAN: Final = dict.fromkeys(("number", "missed", "time_ns"), "<i8")
+_OF_CELLS: Final = dict.fromkeys(("force_n", "force_n_std"), "<f4")
+# What is told of contacts, of which type, and what stands there if it is not known.
+_NOWHERE: Final = (np.nan,) * 3
+_OF_CONTACT: Final[dict[str, tuple[str, Any]]] = {
+    "identity": ("<i8", 0),
+    **dict.fromkeys(("row", "column", "force_n", "force_n_std"), ("<f8", np.nan)),
+    **dict.fromkeys(("position_m", "normal"), ("<f8", _NOWHERE)),
+}
 # So many scans are read at once. Chosen: with more, `SkinReader.read_all` takes as long.
 _READ_SCANS: Final = 64
 # A group of rows in a .parquet has so many scans. Chosen: programs read whole groups, and these are
@@ -60,7 +68,11 @@ def load_forces(
     :raises ValueError: the calibration is of another unit, size or mode.
     """
     part = Part(path, begin_s, end_s, timed=True)
-    return _stacked(part, calibration, _stacks(calibration, None)).arrays() | _marks(part)
+    groups = list(_groups(part, calibration))
+    # Each group gives up its share of an array, so that no more than one array is there twice.
+    return {
+        name: np.concatenate([group.pop(name) for group in groups]) for name in list(groups[0])
+    } | _marks(part)
 
 
 def export(
@@ -93,18 +105,18 @@ def export(
     elif out.suffix == ".parquet":
         _save_parquet(part, calibration, out)
     else:
-        with whole_file(out) as file, _stacks(calibration, out.parent) as stacks:
-            _stacked(part, calibration, stacks).save(file, _marks(part))
+        with whole_file(out) as file, Stacks(out.parent) as stacks:
+            for arrays in _groups(part, calibration):
+                stacks.add(arrays)
+            stacks.save(file, _marks(part))
     return part
 
 
 def read_forces(part: Part, calibration: Calibration) -> Iterator[ForceScan]:
     """The scans of a part of a recording with their forces, each with the tare before it."""
-    scans = _tared(part)
-    first = next(scans)
-    reader = SkinReader(part.boards[-1], calibration)
-    scans = chain([first], scans)
+    scans, reader = _tared(part), None
     while group := list(islice(scans, _READ_SCANS)):
+        reader = reader or SkinReader(part.boards[0], calibration)
         yield from reader.read_all(group)
 
 
@@ -119,34 +131,24 @@ def _tared(part: Part) -> Iterator[Scan]:
         yield scan if tare is None else replace(scan, rest_ratio=tare.rest_ratio)
 
 
-def _stacks(calibration: Calibration, folder: Path | None) -> Stacks:
-    cells = calibration.rows, calibration.columns
-    return Stacks(
-        dict.fromkeys(_OF_SCAN, ("<i8", ()))
-        | dict.fromkeys(_OF_CELLS, ("<f4", cells))
-        | dict.fromkeys(("contact_scan", "contact_identity"), ("<i8", ()))
-        | {f"contact_{name}": ("<f8", ()) for name in _OF_CONTACT}
-        | dict.fromkeys(("contact_position_m", "contact_normal"), ("<f8", (3,))),
-        folder,
-    )
-
-
-def _stacked(part: Part, calibration: Calibration, stacks: Stacks) -> Stacks:
-    for index, scan in enumerate(read_forces(part, calibration)):
-        stacks.add({name: getattr(scan, name) for name in (*_OF_SCAN, *_OF_CELLS)})
-        for contact in scan.contacts:
-            told = {f"contact_{name}": value for name, value in _told(contact).items()}
-            stacks.add({"contact_scan": index, **told})
-    return stacks
-
-
-def _told(contact: Contact) -> dict[str, Any]:
-    nowhere = (np.nan, np.nan, np.nan)
-    told = {name: getattr(contact, name) for name in ("identity", *_OF_CONTACT)}
-    for name in ("position_m", "normal"):
-        known = getattr(contact, name)
-        told[name] = list(nowhere if known is None else known)
-    return told
+def _groups(
+    part: Part, calibration: Calibration, scans: int = _READ_SCANS
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """The arrays of `load_forces`, without the marks, of each so many scans."""
+    all_scans, begin = read_forces(part, calibration), 0
+    while group := list(islice(all_scans, scans)):
+        contacts = [contact for scan in group for contact in scan.contacts]
+        counts = [len(scan.contacts) for scan in group]
+        indices = np.arange(begin, begin + len(group), dtype=np.int64)
+        arrays: dict[str, NDArray[Any]] = {"contact_scan": np.repeat(indices, counts)}
+        for name, kind in (_OF_SCAN | _OF_CELLS).items():
+            arrays[name] = np.array([getattr(scan, name) for scan in group], kind)
+        for name, (kind, unknown) in _OF_CONTACT.items():
+            told = [getattr(contact, name) for contact in contacts]
+            known = [unknown if value is None else value for value in told]
+            arrays[f"contact_{name}"] = np.array(known, kind).reshape(-1, *np.shape(unknown))
+        yield arrays
+        begin += len(group)
 
 
 def _marks(part: Part) -> dict[str, NDArray[Any]]:
@@ -173,23 +175,23 @@ def _save_parquet(part: Part, calibration: Calibration, out: Path) -> None:
         from pyarrow.parquet import ParquetWriter
     except ImportError as exc:
         raise OhmskinError(f".parquet needs {exc.name}: run pip install pyarrow") from exc
-    rows, columns = calibration.rows, calibration.columns
-    three = pa.list_(pa.float64(), 3)
-    contact = {"identity": pa.int64(), **dict.fromkeys(_OF_CONTACT, pa.float64())}
-    contact |= {"position_m": three, "normal": three}
-    forms = dict.fromkeys(_OF_SCAN, pa.int64())
-    forms |= dict.fromkeys(_OF_CELLS, pa.list_(pa.float32(), rows * columns))
-    forms |= {"contacts": pa.list_(pa.struct(contact))}
-    schema = pa.schema(forms, metadata={"rows": str(rows), "columns": str(columns)})
-    scans = read_forces(part, calibration)
-    with whole_file(out) as file, ParquetWriter(file, schema) as writer:
-        while group := list(islice(scans, _GROUP_SCANS)):
-            of_group = [
-                {name: getattr(scan, name) for name in _OF_SCAN}
-                | {name: getattr(scan, name).reshape(-1) for name in _OF_CELLS}
-                | {"contacts": [_told(contact) for contact in scan.contacts]}
-                for scan in group
-            ]
-            writer.write_table(pa.Table.from_pylist(of_group, schema))
+    sizes, begin = {"rows": str(calibration.rows), "columns": str(calibration.columns)}, 0
+
+    def column(array: NDArray[Any]) -> Any:
+        flat, size = pa.array(array.ravel()), math.prod(array.shape[1:])
+        return flat if array.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
+
+    with whole_file(out) as file, ExitStack() as stack:
+        writer: Any = None  # its schema is that of the first group
+        for arrays in _groups(part, calibration, _GROUP_SCANS):
+            columns = {name: column(arrays[name]) for name in _OF_SCAN | _OF_CELLS}
+            ends = begin + np.arange(1 + len(arrays["number"]))
+            offsets = np.searchsorted(arrays["contact_scan"], ends).astype(np.int32)
+            told = [column(arrays[f"contact_{name}"]) for name in _OF_CONTACT]
+            contacts = pa.StructArray.from_arrays(told, list(_OF_CONTACT))
+            columns["contacts"] = pa.ListArray.from_arrays(offsets, contacts)
+            table, begin = pa.table(columns, metadata=sizes), ends[-1]
+            writer = writer or stack.enter_context(ParquetWriter(file, table.schema))
+            writer.write_table(table)
         marks = [{"text": mark.text, "time_ns": mark.time_ns} for mark in part.marks]
         writer.add_key_value_metadata({"marks": json.dumps(marks)})

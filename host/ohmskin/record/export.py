@@ -8,9 +8,9 @@ readings file, and empty in the table.
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
-from io import BytesIO
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
@@ -21,10 +21,10 @@ from zipfile import ZipFile
 
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ohmskin.errors import RecordingError
-from ohmskin.files import Closing, PathName, save_table, whole_file
+from ohmskin.files import PathName, save_table, whole_file
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import MODES
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_FRAMES
@@ -37,29 +37,21 @@ _OF_SCAN: Final = {"number": "<i8", "time_us": "<i8", "host_time_s": "<f8", "mis
 _RATIO: Final = np.dtype("<f4")
 
 
-class Stacks(Closing):
-    """Arrays that grow row by row.
+class Stacks(ExitStack):
+    """Arrays that grow, kept in files without a name in this folder until it is closed."""
 
-    forms: type and shape of a row of each array, by its name.
-    folder: where the rows are kept, in files without a name; None: they are kept in memory.
-    """
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._new = partial(TemporaryFile, dir=folder)
+        self._files: dict[str, Any] = {}
+        self._first: dict[str, NDArray[Any]] = {}  # rows of each array: they say its form
 
-    def __init__(self, forms: dict[str, tuple[str, tuple[int, ...]]], folder: Path | None) -> None:
-        self._forms = forms
-        new = BytesIO if folder is None else partial(TemporaryFile, dir=folder)
-        self._files: dict[str, Any] = {name: new() for name in forms}
-
-    def add(self, rows: Mapping[str, ArrayLike]) -> None:
-        """Add a row to each of these arrays."""
-        for name, row in rows.items():
-            self._files[name].write(np.asarray(row, dtype=self._forms[name][0]).tobytes())
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """All arrays. The stacks must be in memory."""
-        return {
-            name: np.frombuffer(self._files[name].getbuffer(), kind).reshape(-1, *shape)
-            for name, (kind, shape) in self._forms.items()
-        }
+    def add(self, rows: Mapping[str, NDArray[Any]]) -> None:
+        """Add rows (n, ...) to each of these arrays, by name; always of the same type and shape."""
+        for name, array in rows.items():
+            if self._first.setdefault(name, array) is array:
+                self._files[name] = self.enter_context(self._new())
+            self._files[name].write(array.tobytes())
 
     def save(self, file: BinaryIO, more: Mapping[str, Any]) -> None:
         """Write all arrays, and the arrays in `more`, as an .npz.
@@ -68,10 +60,10 @@ class Stacks(Closing):
         page by page.)
         """
         with ZipFile(file, "w") as archive:
-            for name, (kind, shape) in self._forms.items():
-                size = np.dtype(kind).itemsize * math.prod(shape)
-                whole = self._files[name].tell() // size, *shape
-                header = {"descr": kind, "fortran_order": False, "shape": whole}
+            for name, rows in self._first.items():
+                shape, kind = rows.shape[1:], rows.dtype
+                whole = self._files[name].tell() // (kind.itemsize * math.prod(shape)), *shape
+                header = {"descr": kind.str, "fortran_order": False, "shape": whole}
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     npy.write_array_header_1_0(member, header)
                     self._files[name].seek(0)
@@ -79,11 +71,6 @@ class Stacks(Closing):
             for name, values in more.items():
                 with archive.open(f"{name}.npy", "w") as member:
                     npy.write_array(member, np.array(values), allow_pickle=False)
-
-    def close(self) -> None:
-        """Throw away what was kept. May be called again."""
-        for file in self._files.values():
-            file.close()
 
 
 @dataclass
@@ -204,9 +191,7 @@ def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
     scans = iter(part)
     first = next(scans)
     size = first.codes.shape[:2]
-    forms = {"ratio": (_RATIO.str, (*size, len(names)))}
-    forms |= {name: (kind, ()) for name, kind in _OF_SCAN.items()}
-    with whole_file(out) as file, Stacks(forms, out.parent) as stacks:
+    with whole_file(out) as file, Stacks(out.parent) as stacks:
         most = min(
             MAX_FRAMES, MAX_ARRAY_BYTES // (_RATIO.itemsize * size[0] * size[1] * len(names))
         )
@@ -214,8 +199,8 @@ def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
             if part.scans > most:
                 many = f"{part.scans} scans are more than a readings file holds"
                 raise part.error(f"{many}: export a part of them")
-            ratio = _of_names(scan, scan.ratio, names)
-            stacks.add({"ratio": ratio, **{name: getattr(scan, name) for name in _OF_SCAN}})
+            stacks.add({"ratio": _of_names(scan, scan.ratio, names)[None].astype(_RATIO)})
+            stacks.add({name: np.array([getattr(scan, name)], _OF_SCAN[name]) for name in _OF_SCAN})
             tare = part.tare_of(scan)  # now: tares that come after the part are read, too
         board = part.boards[0]
         more = {
