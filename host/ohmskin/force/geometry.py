@@ -135,24 +135,24 @@ class Geometry:
         """
         with naming(path):
             text = read_bounded(path, _MAX_FILE_BYTES).decode(errors="replace")
-            told = _of_urdf(text, rows, columns) if "<" in text else _of_lines(text)
-            count = len(told["normal"])
-            if count != rows * columns:
-                raise ValueError(f"{count} taxels, the skin has {rows}x{columns} cells")
-            told = {name: of_taxels.reshape(rows, columns, 3) for name, of_taxels in told.items()}
+            taxels = _of_urdf(text, rows, columns) if "<" in text else _of_lines(text)
+            if len(taxels) != rows * columns:
+                raise ValueError(f"{len(taxels)} taxels, the skin has {rows}x{columns} cells")
+            position_m, normal = np.split(taxels.reshape(rows, columns, 6), 2, axis=-1)
+            told = {"position_m": position_m, "normal": normal}
             return cls("table", frame_id, rows, columns, told)
 
 
-def _table(taxels: Float) -> dict[str, Float]:
-    return {"position_m": taxels[:, :3], "normal": taxels[:, 3:]}
-
-
-def _of_lines(text: str) -> dict[str, Float]:
+def _of_lines(text: str) -> Float:
+    """Position and normal of each taxel, (n, 6)."""
     lines = [line.split() for line in text.splitlines() if re.fullmatch(_SIX_NUMBERS, line)]
-    return _table(np.array(lines, dtype=np.float64).reshape(-1, 6))
+    return np.array(lines, dtype=np.float64).reshape(-1, 6)
 
 
-def _of_urdf(text: str, rows: int, columns: int) -> dict[str, Float]:
+def _of_urdf(text: str, rows: int, columns: int) -> Float:
+    """Position and normal of each taxel, (n, 6)."""
+    from scipy.spatial.transform import Rotation  # takes long to load, and few files need it
+
     if "<!" in text.replace("<!--", ""):
         raise ValueError("its XML declares types or entities, which no URDF needs")
     try:
@@ -180,10 +180,9 @@ def _of_urdf(text: str, rows: int, columns: int) -> dict[str, Float]:
         spacing_m = numbers(grid, "spacing" if grid.get("spacing") else "size", 2)
         at_m = np.argwhere(np.ones((rows, columns))) * spacing_m
         at_m -= numbers(grid, "offset", 2, "0 0")
-        return _table(np.column_stack([at_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(at_m), 1))]))
+        return np.column_stack([at_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(at_m), 1))])
     taxels = []
     for taxel in sorted(tree.iter("taxel"), key=lambda taxel: int(taxel.get("idx", "0"))):
-        (sr, sp, sy), (cr, cp, cy) = (f(numbers(taxel, "rpy", 3)) for f in (np.sin, np.cos))
-        normal = cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp  # z, turned by rpy
-        taxels.append([*numbers(taxel, "xyz", 3), *normal])
-    return _table(np.array(taxels).reshape(-1, 6))
+        turned = Rotation.from_euler("xyz", numbers(taxel, "rpy", 3))
+        taxels.append([*numbers(taxel, "xyz", 3), *turned.apply([0.0, 0.0, 1.0])])
+    return np.array(taxels).reshape(-1, 6)
