@@ -70,7 +70,7 @@ class SimulatedSkin:
         self._noise_lsb, self._seed = noise_lsb, seed
         self._force_n: ArrayLike = np.zeros((rows, columns))
         self._board = self._pressed(lambda _: self._force_n)
-        hello = BoardDecoder().feed(self._board.advance(0.0), 0.0)[0]
+        (hello,) = BoardDecoder().feed(self._board.advance(0.0), 0.0)
         assert isinstance(hello, Hello)
         self._reader = SkinReader(hello, calibration)
         codes = [self._board.codes_at(0.0) for _ in range(_TARE_SCANS)]
@@ -99,12 +99,11 @@ class SimulatedSkin:
         the same. Raises ValueError for forces of another shape, below 0 or not finite.
         """
         self._force_n = force_n
-        codes = self._board.codes_at(time_s)
+        codes, mode = self._board.codes_at(time_s), self._settings.mode
+        time_us, time_ns = round(1e6 * time_s), round(1e9 * time_s)
         self._number += 1
-        scan = Scan(
-            codes, self._number, round(1e6 * time_s), time_s, 0, mode=self._reader.board.mode
-        )
-        return self._reader.read(replace(scan, time_ns=round(1e9 * time_s)))
+        scan = Scan(codes, self._number, time_us, time_s, 0, mode=mode, time_ns=time_ns)
+        return self._reader.read(scan)
 
     def opened(self, force_n: Callable[[float], ArrayLike]) -> CalibratedSkin:
         """The same skin on an emulated board in real time, as `ohmskin.open` gives one.
