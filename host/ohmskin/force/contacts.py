@@ -134,7 +134,8 @@ def found(touched: Bool, force_n: Float, force_n_std: Float) -> list[list[Contac
     total_n, std_n = sums(of_cells_n), sums(force_n_std[places])
     # A touch that is too light for its curve has no force: then all its cells count alike.
     weights = np.where(total_n[of] > 0, of_cells_n, 1.0)
-    rows, columns = (sums(weights * place) / sums(weights) for place in places[1:])
+    whole = sums(weights)
+    rows, columns = (sums(weights * place) / whole for place in places[1:])
     scans = np.zeros(count, dtype=np.intp)
     scans[of] = places[0]
     contacts: list[list[Contact]] = [[] for _ in touched]

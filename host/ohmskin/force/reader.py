@@ -343,8 +343,9 @@ class SkinReader:
         """`read` of scan after scan by one method, in less time than one by one.
 
         First come all estimates, then all that follows, in few steps for all scans together: a
-        processor keeps the code of either at hand, but not that of both in turn. Raises what `read`
-        does.
+        processor keeps the code of either at hand, but not that of both in turn.
+
+        scans: one or more. Raises what `read` does.
         """
         method = self._wanted
         pairs = [self._estimated(scan, method) for scan in scans]
