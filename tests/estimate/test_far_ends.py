@@ -160,6 +160,23 @@ def test_one_far_end_is_better_than_none(names: str) -> None:
     assert one < 0.7 * none
 
 
+@pytest.mark.parametrize("names", ["abe", "abf"])
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_what_lessons_say_of_a_far_layer_is_no_level_of_the_near_one(
+    method: str, names: str
+) -> None:
+    """All segments are 500 Ohm, so none differs from its layer, and a level is the cell's."""
+    random = np.random.default_rng(2)
+    wires = np.full((8, 8), 500.0)
+    rest = replace(skin_at_rest(8, 8, random), top_wire_ohm=wires, bottom_wire_ohm=wires)
+    estimator = make_estimator(method, knowledge(ten_bits(seen(rest, names)), names))
+    off = []
+    for _ in range(8):
+        found = estimator.estimate(ten_bits(seen(touch(rest, 3, random), names)))
+        off.append(np.abs(found.level / found.cell_siemens - 1)[found.touched])
+    assert np.concatenate(off).max() < 0.05
+
+
 def test_methods_without_wires_say_what_they_take() -> None:
     rest = seen(skin_at_rest(3, 3, np.random.default_rng(1)))
     for method in set(METHODS) - {"joint", "touch"}:

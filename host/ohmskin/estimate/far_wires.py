@@ -290,10 +290,15 @@ class MeasuredWires(WireBelief):
         return np.asarray(reference_ohm * (share if layer == 0 else share.T))
 
     def segment_ohm(self, log_wires: Float) -> Float:
-        """Segments (2, R, C) [ohm], as learned; those of the fit if no frame has been news."""
-        if self._segment_ohm is None:
-            return super().segment_ohm(log_wires)
-        return self._segment_ohm.copy()
+        """Segments (2, R, C) [ohm]: at far ends those learned, once a frame has been news.
+
+        Others are those of the fit: no lesson is about a layer that is sensed at near ends.
+        """
+        segments = super().segment_ohm(log_wires)
+        if self._segment_ohm is not None:
+            far = np.array(self.far)
+            segments[far] = self._segment_ohm[far]
+        return segments
 
     def segment_std(self) -> Float:
         """The deviation of the layer's mean, and that of the segment's difference from it."""
