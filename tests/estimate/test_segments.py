@@ -11,7 +11,7 @@ import pytest
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.estimate import joint
-from ohmskin.estimate.knowledge import WireOhm
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from studies.trials import Trial, random_trial, trial_of
 
@@ -71,3 +71,15 @@ def test_what_segments_differ_by_is_no_part_of_a_force() -> None:
     }
     assert apart["cell_siemens"] > 0.02
     assert apart["level"] < 0.2 * apart["cell_siemens"]
+
+
+@pytest.mark.parametrize("seed", [7, 15])
+def test_usual_wires_that_nobody_told_are_not_taken_for_long_ones(seed: int) -> None:
+    """Their lines have 1.6 kOhm. Single segments make each frame take twice as long."""
+    given = random_trial(8, 8, 6, 10, seed).rounded(10)
+    knowledge = replace(given.knowledge(0), nominal_wire_ohm=NO_WIRES)
+    estimator = make_estimator("joint", knowledge)
+    for ratio in given.ratio:
+        found = estimator.estimate(ratio)
+    # Where segments are learned, some of them are known better than others.
+    assert np.ptp(found.top_wire_ohm_std / found.top_wire_ohm) < 1e-9

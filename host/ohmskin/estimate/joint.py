@@ -94,8 +94,6 @@ LEAD_MOVE_OHM: Final = 20.0
 # wire must not be neglected, and it may hide touches behind it. Chosen: 8 segments of 3 kOhm. From
 # there on, a fit that starts at rest takes fewer steps.
 LONG_LINE_OHM: Final = 24e3
-
-
 # Single segments are learned if a line resists more than this from end to end [ohm], on skins of
 # at most so many cells. Chosen: with shorter lines it gains nothing, and larger skins take long.
 LEARNED_LINE_OHM: Final = 2400.0
@@ -351,8 +349,13 @@ class JointEstimator(Estimator):
 
     @property
     def _should_learn_segments(self) -> bool:
-        """Whether single segments matter, and are not being learned yet."""
-        if any(self._belief.far) or self._belief.learns_segments:
+        """Whether single segments matter, and are not being learned yet.
+
+        They are learned from then on, which takes time. So it does not begin while layers are
+        assumed: the first touches may make usual lines seem long.
+        """
+        belief = self._belief
+        if any(belief.far) or belief.learns_segments or belief.is_assumed:
             return False
         rows, columns = self._shape
         return rows * columns <= LEARNED_CELLS and self._line_ohm() > LEARNED_LINE_OHM
