@@ -93,6 +93,18 @@ def test_touches_teach_what_the_lead_of_each_line_is() -> None:
     assert differ < 1.4 * alike  # 1.9 where nothing is learned of single leads
 
 
+def test_no_lead_below_0_explains_what_long_wires_hide() -> None:
+    """Skins without leads, of which nothing is told: some lessons show minus some kilohms."""
+    off = []
+    for seed in range(3, 11):
+        trial = random_trial(8, 8, 4, 24, seed, wire_ohm=(500.0, 1000.0))
+        answers, _ = estimates(trial, "joint", None)
+        off.append(errors(trial, answers))
+    share, stds_off = np.concatenate(off, axis=1)
+    assert np.mean(stds_off < 4) > 0.995
+    assert np.median(share) < 0.1  # 0.17 where leads may be below 0
+
+
 @pytest.mark.parametrize("ohm", [100.0, 1000.0])
 def test_far_ends_measure_leads_and_are_not_misled(ohm: float) -> None:
     without = random_trial(8, 8, 6, 20, seed=6)

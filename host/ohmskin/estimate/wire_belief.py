@@ -46,6 +46,9 @@ A lesson of `LearnedWires` is one step of a Kalman filter,
 
     m += V H^T S^-1 z ,     V -= V H^T S^-1 H V .
 
+No lead is below 0. So a mean lead that comes out below 0 is moved to 0, and what V says of it is
+taken for the other means.
+
 The first frame of a touch is noisy, as it changes. A calmer one of the same touch takes its place:
 its step starts from m and V as they were before the touch.
 
@@ -526,9 +529,11 @@ def _stepped(before: _Filter, covariance: Float, slopes: Float, residual: Float)
     whitened = solve_lower(factor, np.hstack([by_means, residual[:, None]]))
     gain, misses = whitened[:, :-1], whitened[:, -1]
     score = -0.5 * float(misses @ misses) - float(np.log(factor.diagonal()).sum())
-    return _Filter(
-        before.means + misses @ gain, covariance - gain.T @ gain, MEMORY * before.score + score
-    )
+    means, covariance = before.means + misses @ gain, covariance - gain.T @ gain
+    # The most probable means without a lead below 0: else such a lead, of minus some kilohms, would
+    # explain touches behind long wires.
+    means -= min(means[2] / covariance[2, 2], 0.0) * covariance[2]
+    return _Filter(means, covariance, MEMORY * before.score + score)
 
 
 def _mixture(one: _Filter, other: _Filter, odds: float) -> _Filter:
