@@ -7,8 +7,9 @@ Symbols
 symbol shape          meaning                                                       unit
 ====== ============== ============================================================= ==========
 n                     number of means: the logs of the mean segment of each layer,
-                      the mean lead and what each line's differs from it by, and
-                      two leaks if there are any (`wire_belief`)
+                      the mean lead and what each line's differs from it by, two
+                      leaks if there are any, and what each segment differs from
+                      its mean by, if that is learned (`wire_belief`)
 x      (RC + n,)      log resistances of cells, and the means                       log ohm,
                                                                                     ohm, 1, uS
 m      (RC + n,)      what the prior expects of x                                   as x
@@ -17,7 +18,7 @@ u      (RC + n,)      deviations from the prior: x = m + P^1/2 u                
 y, h   (RC,)          measured and modelled port currents per Vdd, over their noise 1
 J      (RC, RC + n)   dh / du                                                       1
 W      (RC, 2RC)      dh / dw times s, where w are the log segments, and s the      1
-                      deviation of each from its mean
+                      deviation of each from its mean; 0 if x has that
 N      (RC, RC)       covariance of y by its noise and by W: by all that x lacks    1
 S      (RC, RC)       covariance of y by all that is not certain, N + J J^T         1
 O      (RC, RC + n)   J whitened: L^-1 J, with L L^T = S                            1
@@ -25,9 +26,9 @@ O      (RC, RC + n)   J whitened: L^-1 J, with L L^T = S                        
 
 Minimised is (y - h)^T N^-1 (y - h) + |u|^2. The prior of the cells has tails, and P is that of a
 normal: so P of the cells is made anew for these tails at every step (`CellPrior.normal`). What each
-segment differs by from its mean is small. So it is not in x, but is taken for noise, N = 1 + W W^T;
-after the fit, W^T S^-1 (y - h(u) + J u) is the most probable value of it, over s. The steps are
-those of Gauss-Newton in the space of the readings (Tarantola 2005, eq. 3.51),
+segment differs by from its mean is small. So it is not in x until it is learned, but is taken for
+noise, N = 1 + W W^T; after the fit, W^T S^-1 (y - h(u) + J u) is the most probable value of it,
+over s. The steps are those of Gauss-Newton in the space of the readings (Tarantola 2005, eq. 3.51),
 
     u' = J^T S^-1 (y - h(u) + J u) ,   S = J J^T + N ,
 

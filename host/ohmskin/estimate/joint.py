@@ -101,7 +101,9 @@ LEARNED_CELLS: Final = 128
 
 
 class JointEstimator(Estimator):
-    """Finds all 3RC resistances: cells and means of wires by steps, single wires as noise.
+    """Finds all 3RC resistances: cells and means of wires by steps, single segments as noise.
+
+    Where wires are long, single segments are among these means (`learn_segments`).
 
     It learns the wires from frame to frame.
     """
@@ -397,6 +399,8 @@ class JointEstimator(Estimator):
 
     def _prior_followed(self, prior: CellPrior) -> CellPrior:
         """This prior, or a new one if what is believed of the wires has moved too far from it.
+
+        Or a first one with single segments, from where these are to be learned.
 
         `SparseFit` solves its network once for each prior, with the mean wires that this prior is
         about. Each frame corrects small changes of the mean wires to first order; larger ones need

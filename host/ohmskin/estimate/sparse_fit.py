@@ -21,7 +21,7 @@ J      (k, RC)        dI / dx / s                                               
 A      (k, k)         J J^T and the precision of the prior of x                          1
 W      (m, 2RC+n)     dI / dw / s P^1/2 at the m ports where wires matter; w are the log 1
                       segments and the leads, P is their covariance, n the number of
-                      means (`wire_belief`)
+                      means (`wire_belief`). (m, n) where single segments are in these
 S      (m, m)         covariance of r at these ports by noise and wires, 1 + W W^T       1
 ====== ============== ================================================================== ==========
 

@@ -184,7 +184,8 @@ class _State:
 class WireBelief(ABC):
     """Mean and covariance of the wires of a skin, and of its leaks, whoever has shown them.
 
-    Segments are in logs of ohms, the mean lead in ohms, leaks in uS.
+    Segments are in logs of ohms, the mean lead in ohms, what each line's lead differs from it by in
+    shares of it, leaks in uS.
 
     shape: (rows, columns).
     far: whether rows, and columns, are sensed at their far ends.

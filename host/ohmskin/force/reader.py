@@ -271,14 +271,14 @@ class SkinReader:
         # A new estimator judges the readings. The one that reads the scans would begin from the
         # frame before, which may show a touch.
         estimator = self._shared.estimator(self._wanted, self.rest)
-        found = estimator.estimate(rest_ratio)
-        if found.touched.any() and not force:
+        estimate = estimator.estimate(rest_ratio)
+        if estimate.touched.any() and not force:
             remedy = "take everything off the skin, or force the tare if nothing is on it"
-            raise TareRefused(touched_cells(found.touched), remedy)
+            raise TareRefused(touched_cells(estimate.touched), remedy)
         if self.rest is not None and not force:
             # By deviations less: a rest may be too small to be measured.
-            open_level = _OPEN_SHARE * estimator.rest_level() - 2 * found.level_std
-            if np.mean(found.level < open_level) > 0.5:
+            open_level = _OPEN_SHARE * estimator.rest_level() - 2 * estimate.level_std
+            if np.mean(estimate.level < open_level) > 0.5:
                 text = f"most cells conduct less than {_OPEN_SHARE:.0%} of what they did at rest"
                 raise TareRefused(text, "connect the skin, or force the tare if it is connected")
         self._shared.rests.append(Untouched(rest_ratio, now()))

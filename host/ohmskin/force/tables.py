@@ -15,7 +15,7 @@ mark_text, mark_time_ns  M        what was noted, and when, since 1970 [ns]
 ====================== ========== ==============================================================
 
 A .csv has a row a scan without its contacts; a .parquet has a row a scan with a list of them, and
-the marks in the file's metadata. Files are written scan by scan: hours need no more memory.
+the marks in the file's metadata. Files are written some scans at a time: hours need no more memory.
 """
 
 import json
