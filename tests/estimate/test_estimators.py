@@ -306,8 +306,9 @@ def test_levels_are_conductances_but_of_voltage_the_voltages(method: str) -> Non
         np.testing.assert_array_equal(found.touched, by_ohm.touched)
     else:
         at_rest = estimator.estimate(ten_bits(rest)).cell_siemens
-        np.testing.assert_array_equal(found.level, found.cell_siemens)
-        np.testing.assert_array_equal(found.level_std, found.cell_siemens_std)
+        # For `joint` and `touch`, with what wires differ by: next to nothing on a skin without any.
+        np.testing.assert_allclose(found.level, found.cell_siemens, rtol=1e-6)
+        np.testing.assert_allclose(found.level_std, found.cell_siemens_std, rtol=1e-6)
     np.testing.assert_allclose(estimator.rest_level(), at_rest, rtol=0.05)
 
 
