@@ -192,7 +192,11 @@ def test_numbers_of_the_firmware_are_those_of_its_source() -> None:
     slot_min, held = re.findall(r"\((\d+)u \* prescaler\(accuracy\)( / 2)?\)", source(avr))
     assert slot_min == (str(emulator.SLOT_ADC_CLOCKS_MIN), "")
     assert held == (str(round(2 * emulator.HELD_ADC_CLOCKS)), " / 2")
-    told = source("core/settings.cpp").split("Settings default_settings() {")[1].split("\n}")[0]
+    told = (
+        source("core/settings.cpp")
+        .split("void take_defaults(Settings *settings) {")[1]
+        .split("\n}")[0]
+    )
     defaults = EmulatedBoard(Scene().ratio, BoardSettings()).settings
     for name in ("unit_id", "rows", "columns", "rate_mhz", "settle_us", "whole_every"):
         (value,) = re.findall(rf"\b{name}(?: = [\w.]+)* = (\d+);", told)
