@@ -420,7 +420,7 @@ def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one(segments: int)
     slopes = np.hstack([by_segment, [[1, 0, 0, 1, 0], [0, 1, 0, 1, 0]]])  # by all wires
     unlearned = np.diag(np.repeat([0.0 if segments else SEGMENT_STD, 0.0], (12, 5))) ** 2
     of_wires = by_means @ covariance @ by_means.T + unlearned
-    root = belief.per_std(by_segment, np.zeros((2, n)), ports)
+    root = belief.per_std(by_segment, belief.by_means(by_segment, belief.means, ports))
     np.testing.assert_allclose(root @ root.T, slopes @ of_wires @ slopes.T, rtol=1e-6)
     np.testing.assert_allclose(root[:, -n:], belief.per_mean_std(slopes @ by_means), rtol=1e-6)
     stds = np.sqrt(of_wires.diagonal())[:12].reshape(2, 2, 3)

@@ -205,22 +205,8 @@ class PortCircuit:
         return self._slopes(self._wire_current, self._wire_sense_current, ohm)
 
     def by_layers(self) -> Float:
-        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm].
-
-        A port has the currents x of its row less y of its column. So the sum of r x x' of the
-        layer's segments is that of the row, that of the column, and both together: from R+C lines,
-        not from RC ports.
-        """
-        slopes = []
-        for layer, ohm in enumerate(self.wire_ohm):
-            driven, sensed = (
-                each[:, layer].reshape(sum(self.shape), -1)
-                for each in (self._wire_current, self._wire_sense_current)
-            )
-            lines = (driven * np.broadcast_to(ohm, self.shape).ravel()) @ sensed.T
-            at_row, at_column = _ends_of_ports(lines, self.rows)
-            slopes.append((at_row - at_column).ravel())
-        return np.stack(slopes, axis=1)
+        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm]."""
+        return np.asarray(self.by_wires().reshape(self.port_ohm.size, 2, -1).sum(axis=2))
 
     def by_leaks(self) -> Float:
         """Slopes by the leaks of rows, and of columns, (RC, 2) [ohm / S]."""

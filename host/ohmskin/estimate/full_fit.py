@@ -147,17 +147,15 @@ class FullFit:
     def _linearise(self) -> None:
         """Make J, N and S for the present state."""
         self._moved_log = 0.0
-        direct = [self._circuit.by_layers(), self._belief.by_leads(self._means)]
-        if self._belief.has_leaks:
-            direct.append(1e-6 * self._circuit.by_leaks())  # by uS
-        if self._belief.learns_segments:
-            direct.append(self._circuit.by_wires())
+        by_wires = self._circuit.by_wires()
+        by_leaks = 1e-6 * self._circuit.by_leaks() if self._belief.has_leaks else None  # by uS
+        direct = self._belief.by_means(by_wires, self._means, by_leaks=by_leaks)
         self._by_cell = self._weighted(self._circuit.by_cell())
         # Cells at rest follow the means of the wires.
         by_rest = self._by_cell @ self._prior.by_means
-        self._by_mean = self._weighted(np.hstack(direct)) + by_rest
+        self._by_mean = self._weighted(direct) + by_rest
         if self._moved_since_noise > OLD_NOISE_LOG:
-            self._make_noise()
+            self._make_noise(by_wires)
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
         self._cell_std = np.sqrt(self._variance)
         cells = self._cell_std.size
@@ -166,10 +164,13 @@ class FullFit:
         slopes[:, cells:] = self._per_mean_std
         self._factor = cholesky(gram(slopes, onto=self._noise.copy(order="F")))  # L
 
-    def _make_noise(self) -> None:
-        """Make N, and W without s, for the present state."""
+    def _make_noise(self, by_wires: Float) -> None:
+        """Make N, and W without s, for the present state.
+
+        by_wires: slopes of rho by all segments, (RC, 2RC), which are overwritten.
+        """
         self._moved_since_noise = 0.0
-        self._by_segment = self._weighted(self._circuit.by_wires())
+        self._by_segment = self._weighted(by_wires)
         self._noise = np.zeros((self._weight.size,) * 2, order="F")
         if own_std := self._belief.unlearned_std:
             self._noise = own_std**2 * gram(self._by_segment)

@@ -124,6 +124,8 @@ class JointEstimator(Estimator):
         self._rest_ports: PortReadings
         self._rest_means: Float
         self._finder: SparseFit | None = None
+        # The means (n,) that the prior has been compared with.
+        self._followed: Float | None = None
         # The part of a cell's log deviation at rest that comes from the wires; the largest of all
         # cells.
         self._rest_wires_log_std = 0.0
@@ -164,6 +166,7 @@ class JointEstimator(Estimator):
         self._whole_message = ""  # why that frame is no answer, in words, or empty
         self._region: RegionFit | None = None
         self._belief.reset()
+        self._followed = None
         if self.knowledge.rest_ratio is None:
             self._prior = self._finder = None
 
@@ -407,10 +410,13 @@ class JointEstimator(Estimator):
         a new prior and network. Where rows and columns are both sensed at far ends, no reading has
         the wires of its own lines in it. So there a change has to be larger before it matters.
         """
+        means = self._belief.means
+        if means is self._followed:  # as after most frames: this saves some percent of their time
+            return prior
+        self._followed = means
         if self._should_learn_segments:
             self._belief.learn_segments()
             return self._prior_by_rest(self._rest_ports, prior)
-        means = self._belief.means
         # Cells at rest follow the layers by slopes, which hold for small moves only. After a larger
         # move, the rest readings are fitted again. (Readings at far ends hardly depend on the
         # layers.)

@@ -184,11 +184,10 @@ class TouchedNetwork:
         current, sensed = self.cell_current(ports)
         by_cell = current * sensed / self._rest.cell_siemens
         by_cell[:, self._cells if fitted is None else fitted] = 0.0
-        of_cells = by_cell @ prior.by_means
-        if belief.has_leaks:
-            belief.leaks(of_cells.T)[:] += 1e-6 * self.by_leaks(ports).T  # by uS
+        by_leaks = 1e-6 * self.by_leaks(ports) if belief.has_leaks else None  # by uS
         by_wire = self._rest.by_wires_of(ports, current, sensed)
-        return by_cell, belief.per_std(by_wire, of_cells, ports)
+        by_means = belief.by_means(by_wire, belief.means, ports, by_leaks)
+        return by_cell, belief.per_std(by_wire, by_means + by_cell @ prior.by_means)
 
     def by_leaks(self, ports: Cells) -> Float:
         """Slopes of rho of m ports by the leaks of rows, and of columns, (m, 2) [ohm / S].

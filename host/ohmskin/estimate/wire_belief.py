@@ -211,6 +211,11 @@ class WireBelief(ABC):
         self.shape, self.far, self._may_be_bent = shape, far, may_be_bent
         rows, columns = shape
         self.leads_of_ports: Float = np.abs(incidence(rows, columns)) * ~np.repeat(far, shape)
+        # How many top segments, bottom segments and leads are up to each cell, (3, RC).
+        row, column = np.divmod(np.arange(rows * columns), columns)
+        by_row, by_column = np.logical_not(far)
+        leads = self.leads_of_ports.sum(axis=1)
+        self._wires_of_paths = np.array([by_row * (column + 1), by_column * (row + 1), leads])
         self.untold = wires.both is None and not all(far)
         layer_std = UNKNOWN_LAYER_STD if wires.both is None else LAYER_STD
         layer_stds = np.array([wires.top_log_std or 0.0, wires.bottom_log_std or 0.0])
@@ -373,14 +378,27 @@ class WireBelief(ABC):
         """The lead of each line by these means (n,), (R+C,) [ohm]."""
         return np.asarray(means[2] * (1.0 + means[self._of_lines]))
 
-    def by_leads(self, means: Float, ports: Any = slice(None)) -> Float:
-        """Slopes of the resistance of these ports by what their leads are made of, at these means.
+    def by_means(
+        self,
+        by_segment: Float,
+        means: Float,
+        ports: Any = slice(None),
+        by_leaks: Float | None = None,
+    ) -> Float:
+        """How the resistance of k ports follows the means, at these means, (k, n).
 
-        By the mean lead, and by what each line's lead differs from it, (ports, 1 + R+C) [1, ohm].
+        by_segment: how it follows the logs of the segments, (k, 2RC).
+        by_leaks: how it follows the leaks, (k, 2); None: m has no leaks.
         """
-        leads = self.leads_of_ports[ports]
-        by_mean = leads @ (1.0 + means[self._of_lines])
-        return np.hstack([by_mean[:, None], means[2] * leads])
+        slopes, leads = np.empty((len(by_segment), means.size)), self.leads_of_ports[ports]
+        by_segment.reshape(len(slopes), 2, -1).sum(axis=2, out=slopes[:, :2])
+        slopes[:, 2] = leads @ (1.0 + means[self._of_lines])
+        np.multiply(means[2], leads, out=slopes[:, self._of_lines])
+        if by_leaks is not None:
+            slopes[:, self._of_leaks] = by_leaks
+        if self.learns_segments:
+            slopes[:, self._of_segments] = by_segment
+        return slopes
 
     @property
     def expected_wires(self) -> Float:
@@ -438,20 +456,19 @@ class WireBelief(ABC):
         """J L^T V^1/2 from slopes by the means, J L^T: one row a reading, one column a mean."""
         return slopes @ self._root
 
-    def per_std(self, by_segment: Float, by_other: Float, ports: Any) -> Float:
+    def per_std(self, by_segment: Float, by_means: Float) -> Float:
         """J P^1/2: by what segments have of their own (2RC columns), and by the means (n).
 
         The first columns are missing where m has single segments.
-        by_segment: J of the log segments (2RC columns) at these ports.
-        by_other: J of the means (n columns), by what else follows them: leaks, cells at rest.
+        by_segment: J of the log segments, (k, 2RC). by_means: J L^T, (k, n).
         """
-        by_mean = by_other.copy()
-        by_mean[:, :2] += by_segment.reshape(len(by_mean), 2, -1).sum(axis=2)
-        by_mean[:, 2 : self._of_lines.stop] += self.by_leads(self.means, ports)
         if self.learns_segments:
-            by_mean[:, self._of_segments] += by_segment
-            return self.per_mean_std(by_mean)
-        return np.hstack([SEGMENT_STD * by_segment, self.per_mean_std(by_mean)])
+            return self.per_mean_std(by_means)
+        segments = by_segment.shape[1]
+        root = np.empty((len(by_segment), segments + by_means.shape[1]))
+        np.multiply(by_segment, SEGMENT_STD, out=root[:, :segments])
+        np.matmul(by_means, self._root, out=root[:, segments:])
+        return root
 
     def means_off(self, mean_stds: Float) -> Float:
         """The means (n,) that are so many deviations off: m + V^1/2 `mean_stds` (n,)."""
@@ -489,9 +506,9 @@ class WireBelief(ABC):
         segments = self.segment_ohm(wires)
         leads = np.maximum(wires[segments.size :], 0.0)
         path_ohm = self._path_ohm(segments, leads)
-        alike = np.exp(means[:2])[:, None, None] * np.ones(self.shape)
-        usual_ohm = self._path_ohm(alike, np.full_like(leads, max(float(means[2]), 0.0)))
-        return SkinWires(segments, segments * self.segment_std(), path_ohm, path_ohm - usual_ohm)
+        usual = np.array([*np.exp(means[:2]), max(float(means[2]), 0.0)])
+        own_path_ohm = path_ohm - usual @ self._wires_of_paths
+        return SkinWires(segments, segments * self.segment_std(), path_ohm, own_path_ohm)
 
     def _path_ohm(self, segments: Float, leads: Float) -> Float:
         """Wires and leads up to each cell, (RC,), by segments (2, R, C) and leads (R+C,) [ohm]."""
