@@ -328,3 +328,17 @@ def test_a_bent_skin_of_few_cells_is_learned_from_many_touches(method: str) -> N
     np.testing.assert_allclose(learned.both, (375, 750), rtol=0.15)
     # If wires were taken to be (500, 1000) all along, it would be 0.13.
     assert np.quantile(np.concatenate(off[10:]), 0.9) < 0.08
+
+
+@pytest.mark.parametrize("turns", [1.98, 4.0, 8.0])
+def test_steps_that_go_back_and_forth_come_to_an_end(turns: float) -> None:
+    """As of wires and leads that explain the same fingertips: a step is so often what it should be.
+
+    Other steps of the same fit are right.
+    """
+    off, before, share = np.array([1.0, 1.0]), np.zeros(2), 1.0
+    for _ in range(28):  # from the twelfth step on
+        step = -np.array([turns, 1.0]) * off
+        share = full_fit._damped(step, before, share)
+        off, before = off + share * step, step
+    assert np.abs(off).max() < 0.01
