@@ -16,6 +16,7 @@ from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.near_wires import LearnedWires
 from ohmskin.estimate.port_readings import PortReader, PortReadings
 from ohmskin.estimate.prior import (
     LAYER_STD,
@@ -24,7 +25,6 @@ from ohmskin.estimate.prior import (
     SEGMENT_STD,
     CellPrior,
 )
-from ohmskin.estimate.wire_belief import LearnedWires
 from ohmskin.link.codes import quantise, ratio_from_codes
 from skins import reference, ten_bits, told
 from studies.trials import (

@@ -15,10 +15,10 @@ from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.near_wires import LearnedWires
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import LAYER_STD, LEAD_STD, REST_STD, SEGMENT_STD, CellPrior
 from ohmskin.estimate.staying_faults import STAYING_FAULT
-from ohmskin.estimate.wire_belief import LearnedWires
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.protocol import ENUMS, MODES
 from studies.trials import Trial, bent_trial, finger_trial, jump_trial, palm_trial, random_trial

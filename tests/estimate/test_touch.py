@@ -15,6 +15,7 @@ from ohmskin.circuit.skin import Skin, port_resistance_ohm
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.near_wires import LearnedWires
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CHANGED_ODDS,
@@ -26,7 +27,7 @@ from ohmskin.estimate.prior import (
     WARY_ODDS,
 )
 from ohmskin.estimate.sparse_fit import RestNetwork, TouchedNetwork
-from ohmskin.estimate.wire_belief import LearnedWires, Lesson
+from ohmskin.estimate.wire_belief import Lesson
 from ohmskin.record.readings import estimate_file
 from skins import reference, ten_bits, told
 from studies.trials import bent_trial, finger_trial, random_trial, skin_at_rest, touch, trial_of

@@ -29,6 +29,7 @@ from ohmskin.estimate.far_wires import MeasuredWires
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import CellFit
+from ohmskin.estimate.near_wires import LearnedWires
 from ohmskin.estimate.ohm import conductance_from_current
 from ohmskin.estimate.port_faults import LOSS_TEXT, worst_cell
 from ohmskin.estimate.port_readings import PortReadings
@@ -49,7 +50,7 @@ from ohmskin.estimate.prior import (
 from ohmskin.estimate.region_fit import Answer, RegionFit, WholeFrame
 from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_touches
 from ohmskin.estimate.staying_faults import StayingFaults
-from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, LearnedWires, WireBelief
+from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, WireBelief
 
 # The first two numbers are chosen. `make ablate` tries other ones; the table "What each number
 # earns" of docs/estimate.md says what came of it.

@@ -28,87 +28,42 @@ P      (W, W)     covariance of w, L^T V L + s^2
 J      (k, W)     slope of k readings by w, over their noise
 N      (k, k)     covariance of these readings if the means were known: of their  1
                   noise, of cells, and of what wires differ from their means by
-H      (k, n)     slope of these readings by the means, J L^T, whitened by N
-S      (k, k)     covariance of the whitened readings, 1 + H V H^T                1
-z      (k,)       whitened residual of these readings at the mean                 1
 ====== ========== =============================================================== ==========
 
 Leads are no logs, because a lead may be next to nothing, and because readings are nearly linear in
 them. P^1/2 has a column for each segment's own deviation (s), and one for each of m (L^T V^1/2).
 
 There are two kinds of belief, and `joint` asks the same of both: `before_fit`, what this frame and
-those before say of the wires; `after_fit`, to learn from the fit. `LearnedWires`, below, is for
-skins that are read at near ends only. There, a frame says something of the wires once its touches
-are known, so it learns after the fit. `MeasuredWires` (`far_wires`) is for far ends, which show the
-wires before the fit.
-
-A lesson of `LearnedWires` is one step of a Kalman filter,
-
-    m += V H^T S^-1 z ,     V -= V H^T S^-1 H V .
-
-No lead is below 0. So a mean lead that comes out below 0 is moved to 0, and what V says of it is
-taken for the other means.
-
-The first frame of a touch is noisy, as it changes. A calmer one of the same touch takes its place:
-its step starts from m and V as they were before the touch.
-
-A single touch reveals nothing of the wires, because its own resistance is in the same reading. So N
-holds the touched cells as noise without limit. A lead is in all readings of its line, so each
-line's own is learned. What single segments differ from their means by matters where wires resist
-much (`joint.LEARNED_LINE_OHM`), and only there is it learned: it costs time.
-
-A skin bends. So there are two filters. The steady one is for a skin that lies still, as most do:
-before a lesson, a small share of what it knows of the layers fades, so that it follows a slow
-drift. The wary one takes each lesson twice: for wires that are what they were, and, with the odds
-`CHANGED_ODDS`, for wires that have changed since the last lesson, so that no more is known of the
-layers than if nobody had told them (of a skin that may not be bent: than was told). It goes on with
-the mixture of both, by its mean and its covariance. (Such a filter is called generalized
-pseudo-Bayesian, of first order: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to
-Tracking and Navigation*, chapter 11.)
-
-The odds of a mixture are those before the lesson, times the exponential of a difference of scores.
-A score says how well the lesson was expected: it is the log likelihood, without terms that all have
-in common,
-
-    score = - (z . S^-1 z + log det S) / 2 .
-
-What is believed is the mixture of both filters, with the odds `WARY_ODDS` of the wary one before
-any lesson. A filter adds up its scores, and at each lesson the sum keeps the share `MEMORY` of what
-it was.
-
-Most lessons say too little to show a change. A fit takes what is believed, which has the least
-error on a skin that lies still. But the upper deviations of its answer are as wide as those of the
-wary filter: if wires have just grown longer, cells conduct more than they seem to.
+those before say of the wires; `after_fit`, to learn from the fit. `LearnedWires`
+(`near_wires`) is for skins that are read at near ends only. There, a frame says something of the
+wires once its touches are known, so it learns after the fit. `MeasuredWires` (`far_wires`) is for
+far ends, which show the wires before the fit.
 """
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.skin import incidence
-from ohmskin.circuit.small import cholesky, solve_lower
+from ohmskin.circuit.small import solve_lower
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
-    CHANGED_ODDS,
     LAYER_STD,
     MAX_STEP_LOG,
-    MEMORY,
     REACH_STDS,
     SEGMENT_STD,
-    STEADY_FADE,
     UNKNOWN_LAYER_STD,
     UNKNOWN_LEAD_STD_OHM,
     UNKNOWN_WIRE_OHM,
     UNTOLD_REACH_STDS,
     USUAL_LEAD_STD_OHM,
-    WARY_ODDS,
     WireStds,
 )
 
@@ -382,7 +337,7 @@ class WireBelief(ABC):
         self,
         by_segment: Float,
         means: Float,
-        ports: Any = slice(None),
+        ports: NDArray[np.intp] | slice = slice(None),
         by_leaks: Float | None = None,
     ) -> Float:
         """How the resistance of k ports follows the means, at these means, (k, n).
@@ -525,155 +480,3 @@ class WireBelief(ABC):
             for array in (wires.segment_ohm, wires.segment_std_ohm):
                 array.setflags(write=False)  # they are in more than one estimate
         return self._state.wires
-
-
-class _Filter(NamedTuple):
-    """A filter: m and V; score: the sum of how well it has expected the lessons."""
-
-    means: Float
-    covariance: Float
-    score: float = 0.0
-
-
-def _stepped(before: _Filter, covariance: Float, slopes: Float, residual: Float) -> _Filter:
-    """This filter after a lesson, before which its V is `covariance` (n, n).
-
-    slopes: H, (k, n). residual: z at the filter's own m, (k,).
-    """
-    by_means = slopes @ covariance
-    expected = by_means @ slopes.T
-    np.einsum("ii->i", expected)[:] += 1.0
-    factor = cholesky(expected)
-    whitened = solve_lower(factor, np.hstack([by_means, residual[:, None]]))
-    gain, misses = whitened[:, :-1], whitened[:, -1]
-    score = -0.5 * float(misses @ misses) - float(np.log(factor.diagonal()).sum())
-    means, covariance = before.means + misses @ gain, covariance - gain.T @ gain
-    # The most probable means without a lead below 0: else such a lead, of minus some kilohms, would
-    # explain touches behind long wires.
-    means -= min(means[2] / covariance[2, 2], 0.0) * covariance[2]
-    return _Filter(means, covariance, MEMORY * before.score + score)
-
-
-def _mixture(one: _Filter, other: _Filter, odds: float) -> _Filter:
-    """Mean and covariance of both. odds: of the other to the one, before their scores."""
-    log_odds = math.log(odds) + other.score - one.score
-    share = 1.0 / (1.0 + math.exp(min(-log_odds, 500.0)))
-    apart = other.means - one.means
-    covariance = (1 - share) * one.covariance + share * other.covariance
-    covariance += share * (1 - share) * np.outer(apart, apart)
-    score = one.score + np.logaddexp(0.0, log_odds) - math.log1p(odds)
-    return _Filter(one.means + share * apart, covariance, float(score))
-
-
-class LearnedWires(WireBelief):
-    """Wires at near ends: touches that share wires reveal the layers, a Kalman step a touch."""
-
-    def reset(self) -> None:
-        """Back to the nominal wires."""
-        super().reset()
-        self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
-        known = _Filter(self._known.means, self._known.covariance)
-        self._filters = self._before_lesson = [known] * 2
-
-    def learn_segments(self) -> None:
-        """As of any belief. Each filter learns them."""
-        super().learn_segments()
-
-        def with_segments(one: _Filter) -> _Filter:
-            means = np.concatenate([one.means, self._nominal[self._of_segments]])
-            return _Filter(means, self._with_segments(one.covariance), one.score)
-
-        self._filters, self._before_lesson = (
-            [with_segments(one) for one in filters]
-            for filters in (self._filters, self._before_lesson)
-        )
-
-    def before_fit(self, log_cells: Float, ports: PortReadings) -> None:
-        """Nothing: before its touches are known, a frame of near ends shows no wires."""
-
-    def fix_rest_wires(self) -> None:
-        """Nothing: an untouched skin shows no wires, as its cells resist far more than they do."""
-
-    def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
-        """Learn from a touch that is new, or again from a calmer frame of the last one.
-
-        The calmer frame must not count as one more, since both have the touch's errors. So it
-        takes the place of the other.
-        """
-        noise = float(ports.current_std.mean())
-        is_news = self._is_news(fit.log_cells)
-        if not (again or is_news or noise < self._lesson_noise):
-            return False
-        self._lesson_cells, self._lesson_noise = fit.log_cells, noise
-        before = self._known.means
-        self.take(fit.lesson, replace_last=again or not is_news)
-        moved = np.abs(self._known.means - before)[:3]
-        return bool((moved > [LARGE_MOVE_LOG, LARGE_MOVE_LOG, USUAL_LEAD_STD_OHM]).any())
-
-    def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
-        """One Kalman step.
-
-        replace_last: undo the last lesson first, by a step from where that lesson started. A lesson
-            that says nothing undoes nothing.
-        """
-        if not replace_last:
-            self._before_lesson = self._filters
-        per_mean_std, residual, factor = lesson
-        # The unknown resistance of its touch explains a single reading: it says nothing of wires.
-        if len(residual) < 2:
-            return
-        # The lesson is counted in deviations of the belief that the fit had, but the step may start
-        # from an older belief. So its slopes are first brought to logs.
-        slopes = solve_lower(self._root, per_mean_std.T, transposed=True).T
-        both = solve_lower(factor, np.hstack([slopes, residual[:, None]]))
-        if len(both) > both.shape[1]:  # the same sums of squares and of products, in fewer rows
-            both = np.asarray(np.linalg.qr(both, mode="r"), np.float64)
-        slopes, residual = both[:, :-1], both[:, -1]
-
-        def stepped(before: _Filter, covariance: Float) -> _Filter:
-            here = residual - slopes @ (before.means - self.means)
-            return _stepped(before, covariance, slopes, here)
-
-        steady, wary = map(self._dried, self._before_lesson)
-        steady = stepped(steady, self._faded(steady))
-        stayed, changed = stepped(wary, wary.covariance), stepped(wary, self._changed(wary))
-        wary = _mixture(stayed, changed, CHANGED_ODDS)
-        self._filters = [steady, wary]
-        believed = _mixture(steady, wary, WARY_ODDS)
-        self._believe(believed.means, believed.covariance)
-
-    def _faded(self, before: _Filter) -> Float:
-        """V of a filter before a lesson, (n, n), if wires may have drifted since the last one."""
-        told = np.minimum(np.diagonal(self._prior_covariance)[:2], LAYER_STD**2)
-        widened, own = self._widened(before, told), self._of_segments
-        widened[own] = widened[:, own] = 0.0
-        widened[own, own] = self._prior_covariance[own, own]
-        return before.covariance + STEADY_FADE * (widened - before.covariance)
-
-    def _changed(self, before: _Filter) -> Float:
-        """The same, if they have changed altogether."""
-        if self._may_be_bent:
-            return self._widened(before, np.full(2, UNKNOWN_LAYER_STD**2))
-        return self._widened(before, np.diagonal(self._prior_covariance)[:2])
-
-    def _widened(self, before: _Filter, layers: Float) -> Float:
-        """V (n, n), if of the layers no more is known than these variances (2,)."""
-        covariance = before.covariance.copy()
-        covariance[:2] = covariance[:, :2] = 0.0
-        variances = np.diagonal(before.covariance)[:2]
-        covariance[:2, :2] = np.diag(np.maximum(variances, layers))
-        return covariance
-
-    def _dried(self, before: _Filter) -> _Filter:
-        """This filter, with leaks that are no better known than at first: a damp skin dries."""
-        if not self.has_leaks:
-            return before
-        covariance, leaks = before.covariance.copy(), self._of_leaks
-        covariance[leaks] = covariance[:, leaks] = 0.0
-        first, now = np.diagonal(self._prior_covariance), np.diagonal(before.covariance)
-        covariance[leaks, leaks] = np.diag(np.maximum(first, now)[leaks])
-        return before._replace(covariance=covariance)
-
-    def _wary_layer_stds(self) -> Float:
-        wary = self._filters[1]
-        return np.hypot(np.sqrt(wary.covariance.diagonal()), wary.means - self.means)[:2]
