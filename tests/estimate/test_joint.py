@@ -342,3 +342,13 @@ def test_steps_that_go_back_and_forth_come_to_an_end(turns: float) -> None:
         share = full_fit._damped(step, before, share)
         off, before = off + share * step, step
     assert np.abs(off).max() < 0.01
+
+
+def test_a_shortened_step_that_turns_back_is_shortened_more() -> None:
+    """Half of a step led as far beyond the place where steps are 0 as the fit was before it."""
+    before = np.array([1.0, 2.0])
+    assert full_fit._damped(-before, before, 1.0) == pytest.approx(0.5)
+    assert full_fit._damped(-before, before, 0.5) == pytest.approx(0.25)
+    assert full_fit._damped(0.5 * before, before, 0.25) == pytest.approx(
+        0.5
+    )  # too short, so longer
