@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What single segments of long wires differ from their layers by: learned; no part of forces."""
+"""What wires are told wrongly by, or single segments differ by: learned, and no part of forces."""
 
 from __future__ import annotations
 
@@ -42,17 +42,18 @@ def test_touches_teach_single_segments_of_long_wires(monkeypatch: pytest.MonkeyP
     assert np.median(share) < 0.8 * np.median(without)
 
 
+def pressed(rest: Skin, cell: tuple[int, int]) -> Skin:
+    """This skin with one cell pressed to 2 kOhm."""
+    siemens = rest.cell_siemens.copy()
+    siemens[cell] = 1 / 2000
+    return replace(rest, cell_siemens=siemens)
+
+
 def test_what_segments_differ_by_is_no_part_of_a_force() -> None:
     """Cells pressed alone, as for a calibration; and again, once segments are known."""
     trial = random_trial(8, 8, 8, 120, seed=2, wire_ohm=LONG)
     cells = [(7, 7), (6, 5), (5, 6), (7, 4), (3, 7)]
-
-    def pressed(cell: tuple[int, int]) -> Skin:
-        siemens = trial.rest.cell_siemens.copy()
-        siemens[cell] = 1 / 2000
-        return replace(trial.rest, cell_siemens=siemens)
-
-    alone = [pressed(cell) for cell in cells]
+    alone = [pressed(trial.rest, cell) for cell in cells]
     given = trial_of(trial.rest, [*alone, *trial.frames, *alone], LONG).rounded(10)
     # Layers are known, so that single segments alone are learned.
     wires = WireOhm(*LONG, 0.0, 0.01, 0.01)
@@ -71,6 +72,54 @@ def test_what_segments_differ_by_is_no_part_of_a_force() -> None:
     }
     assert apart["cell_siemens"] > 0.02
     assert apart["level"] < 0.2 * apart["cell_siemens"]
+
+
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_what_wires_were_told_wrongly_by_is_no_part_of_a_force(method: str) -> None:
+    """Told half of the wires, by presses that hardly know them; and again, once they are learned.
+
+    A new session begins with the learned wires. It gives the same level, from its first frame on.
+    """
+    cells = [(3, 3), (2, 1), (0, 3)]
+    trial = random_trial(4, 4, 4, 40, seed=1, wire_ohm=LONG)
+    alone = [pressed(trial.rest, cell) for cell in cells]
+    given = trial_of(trial.rest, [*alone, *trial.frames, *alone], LONG).rounded(10)
+    told = WireOhm(0.5 * LONG[0], 0.5 * LONG[1], 0.0, 0.7, 0.7, 1.0)
+    known = replace(given.knowledge(0), nominal_wire_ohm=told)
+    estimator = make_estimator(method, known)
+    answers = [estimator.estimate(ratio) for ratio in given.ratio]
+    learned = told.or_surer(estimator.wires())
+    assert learned.top is not None
+    assert learned.top > 0.8 * LONG[0]
+    again = make_estimator(method, replace(known, nominal_wire_ohm=learned))
+    anew = [again.estimate(ratio) for ratio in given.ratio[-3:]]
+    for cell, first, late, new in zip(cells, answers, answers[-3:], anew, strict=False):
+        assert late.cell_siemens[cell] > 1.2 * first.cell_siemens[cell]
+        for later in (late, new):
+            assert later.level[cell] == pytest.approx(first.level[cell], rel=0.1)
+
+
+def test_what_a_skin_is_stretched_by_is_no_part_of_a_level() -> None:
+    """Wires that were well known when cells were pressed, and have doubled since."""
+    trial = random_trial(4, 4, 4, 40, seed=1, wire_ohm=LONG)
+    told = WireOhm(0.5 * LONG[0], 0.5 * LONG[1], 0.0, 0.02, 0.02, 1.0)
+    given = trial.rounded(10)
+    estimator = make_estimator("joint", replace(given.knowledge(0), nominal_wire_ohm=told))
+    for ratio in given.ratio:
+        found = estimator.estimate(ratio)
+    # What single wires differ by is in the level, whatever the layers do.
+    off = np.abs(found.level / found.cell_siemens - 1)[found.touched]
+    assert off.max() < 0.2
+
+
+def test_wires_that_are_learned_twice_are_still_those_of_the_curves() -> None:
+    told = WireOhm(100.0, 200.0, 80.0, 0.3, 0.3, 50.0)
+    once = WireOhm(144.0, 200.0, 200.0, 0.1, 0.0, 10.0).for_curves_of(told)
+    # Half of the change was there when they were told: by a deviation of 0.3, as of stretch.
+    assert once.of_curves[:3] == pytest.approx((120.0, 200.0, 80.0))
+    twice = WireOhm(144.0, 300.0, 90.0, 0.1, 0.1, 5.0).for_curves_of(once)
+    assert twice.of_curves[:3] == pytest.approx((120.0, 300.0, 80.0))
+    assert told.for_curves_of(NO_WIRES) == told  # nobody knows what the curves were made with
 
 
 @pytest.mark.parametrize("seed", [7, 15])

@@ -17,6 +17,7 @@ from ohmskin.arrays import Float
 from ohmskin.calibrate.regression import ForceRegression
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import MAX_FILE_BYTES, Calibration, Rest, load_calibration
 from ohmskin.force.curve import POWER
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -71,6 +72,19 @@ def assert_same(first: Any, second: Any) -> None:
             assert one == other, field.name
 
 
+def test_the_curve_of_all_presses_has_the_hidden_wires_of_the_pressed_cells() -> None:
+    """Five of six cells were pressed. Each has its own wires in its curve; the last, their mean."""
+    of_skin = calibration()
+    found = make_estimator("touch", SkinKnowledge(2, 3)).estimate(of_skin.rest.ratio)
+    hidden_ohm = np.array([[100.0, -50.0, 400.0], [300.0, -250.0, 900.0]])
+    cell_ohm = np.full((2, 3), 2000.0)
+    found = replace(found, cell_siemens=1 / cell_ohm, level=1 / (cell_ohm + hidden_ohm))
+    expected_ohm = np.array([[2100.0, 1950.0, 2400.0], [2300.0, 1750.0, 2100.0]])
+    np.testing.assert_allclose(1 / of_skin.level(found), expected_ohm)
+    # `matrix` takes no wires into account.
+    np.testing.assert_array_equal(of_skin.level(replace(found, wires="")), found.level)
+
+
 @pytest.mark.parametrize("pressed", [1, 5])
 def test_round_trip_is_bit_for_bit(tmp_path: Path, pressed: int) -> None:
     saved = calibration(pressed)
@@ -90,7 +104,8 @@ def test_round_trip_is_bit_for_bit(tmp_path: Path, pressed: int) -> None:
 
 def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
     before = calibration()
-    tared = replace(before, tare=rest(3, "2025-03-02T08:00:00+00:00"))
+    wires = WireOhm(150.0, 200.0, 80.0, 0.1, 0.1, 20.0, 100.0, 300.0, 0.0)
+    tared = replace(before, tare=rest(3, "2025-03-02T08:00:00+00:00"), nominal_wire_ohm=wires)
     path = tmp_path / "skin.json"
     tared.save(path)
     loaded = load_calibration(path)
@@ -105,7 +120,7 @@ def test_files_of_before_leads_and_modes_are_read(tmp_path: Path) -> None:
     path = tmp_path / "skin.json"
     calibration().save(path)
     content = json.loads(path.read_text())
-    for name in ("mode", "nominal_lead_ohm", "lead_std_ohm", "top_wire_log_std"):
+    for name in ("mode", "nominal_lead_ohm", "lead_std_ohm", "top_wire_log_std", "curve_lead_ohm"):
         del content[name]
     for name in ("bottom_wire_log_std", "largest_force_n"):
         del content[name]

@@ -93,7 +93,9 @@ def _keep_wires(diagnosis: Diagnosis, told: WireOhm, into: Path) -> None:
         raise ValueError(f"{into} is as it was: neither presses nor far ends have told the wires")
     if wires.lead is None:
         wires = wires._replace(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
-    replace(load_calibration(into), nominal_wire_ohm=wires).save(into)
+    calibration = load_calibration(into)
+    wires = wires.for_curves_of(calibration.nominal_wire_ohm)
+    replace(calibration, nominal_wire_ohm=wires).save(into)
 
 
 def _unanswered(port: str, error: errors.OhmskinError) -> Finding:

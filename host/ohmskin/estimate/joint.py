@@ -314,7 +314,7 @@ class JointEstimator(Estimator):
         wider = max(1.0, fit.misfit, fit.surprise) ** 0.5
         cell_ohm = np.exp(fit.log_cells)
         # At least half of the cell: what wires lack must not make it negative.
-        level = 1.0 / np.maximum(cell_ohm + wires.own_path_ohm, 0.5 * cell_ohm)
+        level = 1.0 / np.maximum(cell_ohm + wires.hidden_path_ohm, 0.5 * cell_ohm)
         return Solution(
             cell_siemens=(1.0 / cell_ohm).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),

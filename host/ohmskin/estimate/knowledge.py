@@ -44,6 +44,8 @@ class WireOhm(NamedTuple):
         for all lines alike [ohm]; 0: nothing.
     top_log_std, bottom_log_std: standard deviations of the logs of these, where they were measured.
     lead_std_ohm: the same of the lead [ohm]. A lead may be next to nothing, which has no log.
+    curve_top, curve_bottom, curve_lead: what curves of presses take the wires for [ohm], if others
+        have been learned since the presses; None: top, bottom and lead.
     """
 
     top: float | None = None
@@ -52,6 +54,9 @@ class WireOhm(NamedTuple):
     top_log_std: float | None = None
     bottom_log_std: float | None = None
     lead_std_ohm: float | None = None
+    curve_top: float | None = None
+    curve_bottom: float | None = None
+    curve_lead: float | None = None
 
     def check(self) -> Self:
         """Return this object. Raises ValueError, naming the field, if one is not 0..`MAX_OHM`."""
@@ -86,7 +91,41 @@ class WireOhm(NamedTuple):
             better = found._replace(lead=self.lead, lead_std_ohm=self.lead_std_ohm)
         if surer(found.lead_std_ohm, 0.5 * self.lead_or_usual(USUAL_LEAD_STD_OHM)[1]):
             better = better._replace(lead=found.lead, lead_std_ohm=found.lead_std_ohm)
-        return better
+        return better.for_curves_of(self)
+
+    @property
+    def told_share(self) -> tuple[float, float, float]:
+        """How much of a difference from top, bottom and lead was there when they were told [1].
+
+        Layers differ because they were told wrongly, by their deviation, or because the skin has
+        been stretched since, by `LAYER_STD`. Leads do not stretch. Where nobody has told layers, it
+        is 0.
+        """
+        if self.both is None:
+            return 0.0, 0.0, 0.0
+        top, bottom = ((std or 0.0) ** 2 for std in self[3:5])
+        return top / (top + LAYER_STD**2), bottom / (bottom + LAYER_STD**2), 1.0
+
+    @property
+    def of_curves(self) -> "WireOhm":
+        """These wires as curves of presses take them."""
+        both = zip(self[:3], self[6:], strict=True)
+        top, bottom, lead = (own if curve is None else curve for own, curve in both)
+        return WireOhm(top, bottom, lead, *self[3:6])
+
+    def for_curves_of(self, before: "WireOhm") -> "WireOhm":
+        """These wires, which were learned later, for curves of presses that were told `before`.
+
+        A press alone shows a cell and the wires up to it as one. So what `before` was wrong by is
+        in the curves. What the skin was stretched by since is not (`told_share`).
+        """
+        curve = before.of_curves
+        if self is before or self.both is None or before.both is None or curve.both is None:
+            return self
+        moved = np.maximum(self.both, 1e-3) / np.maximum(before.both, 1e-3)
+        top, bottom = curve.both * moved ** (1.0 - np.array(before.told_share[:2]))
+        lead, _ = curve.lead_or_usual(0.0)
+        return self._replace(curve_top=float(top), curve_bottom=float(bottom), curve_lead=lead)
 
     @property
     def both(self) -> tuple[float, float] | None:
@@ -103,6 +142,9 @@ WIRE_FIELDS: Final = (
     "top_wire_log_std",
     "bottom_wire_log_std",
     "lead_std_ohm",
+    "curve_top_wire_ohm",
+    "curve_bottom_wire_ohm",
+    "curve_lead_ohm",
 )
 
 

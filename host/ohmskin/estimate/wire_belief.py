@@ -79,6 +79,12 @@ LOWEST_LEAK_US: Final = -0.1
 CircuitT = TypeVar("CircuitT", bound=PortCircuit)
 
 
+def _means_of(wires: WireOhm) -> Float:
+    """Logs of both layers, and the lead, (3,): the usual ones where nobody has told them."""
+    layers = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in wires[:2]]
+    return np.array([*np.log(layers), wires.lead_or_usual(0.0)[0]])
+
+
 class Lesson(NamedTuple):
     """What k readings of one frame say of the wires.
 
@@ -111,13 +117,14 @@ class SkinWires:
     segment_ohm: segments of top and bottom layer, (2, R, C) [ohm].
     segment_std_ohm: their standard deviations, (2, R, C) [ohm].
     path_ohm: wires and leads between each cell and the sensed ends of its lines, (RC,) [ohm].
-    own_path_ohm: what of it comes from how single wires differ from their means, (RC,) [ohm].
+    hidden_path_ohm: what of it curves of presses take for a part of the cell, (RC,) [ohm]: what
+        single wires differ from their means by, and what the means were told wrongly by.
     """
 
     segment_ohm: Float
     segment_std_ohm: Float
     path_ohm: Float
-    own_path_ohm: Float
+    hidden_path_ohm: Float
 
 
 @dataclass(eq=False)
@@ -179,8 +186,7 @@ class WireBelief(ABC):
         if may_be_bent or not layer_stds.all():
             layer_stds = np.hypot(layer_std, layer_stds)
         layer_stds = np.maximum(layer_stds, 0.01)
-        lead_ohm, lead_std_ohm = wires.lead_or_usual(UNKNOWN_LEAD_STD_OHM)
-        lead_std_ohm = max(lead_std_ohm, 1e-3)
+        lead_std_ohm = max(wires.lead_or_usual(UNKNOWN_LEAD_STD_OHM)[1], 1e-3)
         self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
         # Where each line's own lead is in m.
         self._of_lines = slice(3, 3 + rows + columns)
@@ -188,8 +194,11 @@ class WireBelief(ABC):
         self._of_leaks = self._of_segments = slice(3 + rows + columns, 3 + rows + columns)
         own = np.full(rows + columns, SEGMENT_STD)
         self._prior_covariance = np.diag([*layer_stds, lead_std_ohm, *own]) ** 2
-        nominal = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in wires[:2]]
-        self._nominal: Float = np.array([*np.log(nominal), lead_ohm, *np.zeros(rows + columns)])
+        told = _means_of(wires)
+        self._nominal: Float = np.concatenate([told, np.zeros(rows + columns)])
+        # What curves take for the first three of m follows these by a share, and begins here.
+        self._curve_share = 1.0 - np.array(wires.told_share)
+        self._curve_means = _means_of(wires.of_curves) - self._curve_share * told
         self.reset()
 
     def expect_leaks(self, leaks_us: Float, stds_us: Float) -> None:
@@ -461,9 +470,10 @@ class WireBelief(ABC):
         segments = self.segment_ohm(wires)
         leads = np.maximum(wires[segments.size :], 0.0)
         path_ohm = self._path_ohm(segments, leads)
-        usual = np.array([*np.exp(means[:2]), max(float(means[2]), 0.0)])
-        own_path_ohm = path_ohm - usual @ self._wires_of_paths
-        return SkinWires(segments, segments * self.segment_std(), path_ohm, own_path_ohm)
+        curve = self._curve_means + self._curve_share * means[:3]
+        curve_ohm = np.array([*np.exp(curve[:2]), max(float(curve[2]), 0.0)])
+        hidden_ohm = path_ohm - curve_ohm @ self._wires_of_paths
+        return SkinWires(segments, segments * self.segment_std(), path_ohm, hidden_ohm)
 
     def _path_ohm(self, segments: Float, leads: Float) -> Float:
         """Wires and leads up to each cell, (RC,), by segments (2, R, C) and leads (R+C,) [ohm]."""

@@ -18,6 +18,9 @@ nominal_lead_ohm                           from a multiplexer's common pin to th
 top_wire_log_std                           standard deviations of the logarithms of both segments;
 bottom_wire_log_std                        null: not measured
 lead_std_ohm                               standard deviation of the lead [ohm]; null: not measured
+curve_top_wire_ohm                         the wires that the curves are of [ohm], if others were
+curve_bottom_wire_ohm                      learned since the presses; absent or null: those above
+curve_lead_ohm
 indenter_area_m2                           what the skin was pressed with [m^2]; null: anything, by
                                            the total force on the skin, so there is no pressure
 rest.date                                  ISO 8601
@@ -50,6 +53,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.configurations import READINGS_PER_CELL, is_near
+from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import NO_WIRES, WIRE_FIELDS, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
@@ -207,6 +211,20 @@ class Calibration:
             told = f"'ohmskin configure PORT --unit-id {self.unit_id} --save'"
             remedy = f"calibrate this skin, or {told} if it is that one, with a new board"
             raise ValueError(f"this calibration is of {units}: {remedy}")
+
+    def level(self, estimate: Estimate) -> Float:
+        """What the forces of a frame are read from, (R, C): `Estimate.level`, with one exception.
+
+        Curves of cells that were pressed alone have wires in them that presses do not show. The
+        curve of all presses has those of the cells that were pressed, on average. So for a cell
+        that has no curve of its own, these take the place of its own such wires.
+        """
+        level, siemens, pooled = estimate.level, estimate.cell_siemens, self.model.pooled
+        if not estimate.wires or not pooled.any() or pooled.all():
+            return level
+        hidden_ohm = float(np.mean(1.0 / level[~pooled] - 1.0 / siemens[~pooled]))
+        in_series = 1.0 / np.maximum(1.0 / siemens + hidden_ohm, 0.5 / siemens)
+        return np.where(pooled, in_series, level)
 
     def forces(self, rise: Float, rise_std: Float, touched: Bool) -> tuple[Float, Float]:
         """Force and its standard deviation [N], (..., R, C), of what cells show, in any scans.

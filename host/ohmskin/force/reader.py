@@ -377,7 +377,9 @@ class SkinReader:
         self._shared.hear(self._estimator)
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
         at_rest = np.median(estimate.level) if self._rest_level is None else self._rest_level
-        return estimate, np.asarray(estimate.level - at_rest)
+        calibration = self._shared.calibration if method == self.force_method else None
+        level = estimate.level if calibration is None else calibration.level(estimate)
+        return estimate, np.asarray(level - at_rest)
 
     def _shown(
         self,

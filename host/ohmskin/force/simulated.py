@@ -55,6 +55,7 @@ class SimulatedSkin:
                 "a calibration by 'voltage' knows no conductances: take another method"
             )
         rows, columns, wires = calibration.rows, calibration.columns, calibration.nominal_wire_ohm
+        wires = wires.of_curves  # the cells below are those of the curves
         told = (wires.top, TOP_WIRE_OHM), (wires.bottom, BOTTOM_WIRE_OHM), (wires.lead, LEAD_OHM)
         top, bottom, lead = (usual if known is None else known for known, usual in told)
         drawn = Scene("rest", rows, columns, seed=seed).rest
@@ -72,7 +73,7 @@ class SimulatedSkin:
         self._board = self._pressed(lambda _: self._force_n)
         (hello,) = BoardDecoder().feed(self._board.advance(0.0), 0.0)
         assert isinstance(hello, Hello)
-        self._reader = SkinReader(hello, calibration)
+        self._reader = SkinReader(hello, replace(calibration, nominal_wire_ohm=wires))
         codes = [self._board.codes_at(0.0) for _ in range(_TARE_SCANS)]
         self._reader.tare(ratio_from_codes(np.mean(codes, axis=0), ADC_BITS), force=True)
 
