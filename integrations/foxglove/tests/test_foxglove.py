@@ -28,6 +28,10 @@ from ohmskin import live
 from ohmskin.record.recorder import Recorder
 from ohmskin_foxglove import COLOUR, CONTACTS, NAMES, POINTS, add_clouds
 
+# Programs are ended as by a keyboard. Where this process was started with SIGINT ignored, as in the
+# background of a shell, they would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 HERE = Path(__file__).parents[1]
 URL = "emulator://8x8?scene=moving&seed=1&begin=0"
 
