@@ -20,6 +20,7 @@ from contextlib import suppress
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -171,7 +172,7 @@ def main() -> None:
     rclpy.init()
     try:
         node = SkinNode()
-    except (ValueError, ohmskin.OhmskinError) as exc:
+    except (ValueError, ohmskin.OhmskinError, ParameterException) as exc:
         rclpy.try_shutdown()
         raise SystemExit(f"ohmskin_ros: {exc}") from exc
     try:

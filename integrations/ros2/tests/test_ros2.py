@@ -4,11 +4,13 @@
 import ast
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,10 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image, PointCloud2
 from std_srvs.srv import Trigger
+
+# Programs are ended as by a keyboard. Where this process was started with SIGINT ignored, as in the
+# background of a shell, they would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 HERE = Path(__file__).parents[1]
 URL = "emulator://8x8?scene=ghost&seed=1"
@@ -179,35 +185,91 @@ def test_the_doctor_says_what_is_wrong(node: Callable, reader: Node) -> None:
     until(reader, lambda: int(states[-1][0].values[0].value) > before + 90)  # it goes on
 
 
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", "-p"]
-    done = subprocess.run(
-        [*command, f"calibration:={tmp_path}/no.json"], capture_output=True, text=True
-    )
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ("calibration:=no.json", "no.json: cannot be read"),
+        ("every:=maybe", "'every' to 'maybe' of type 'STRING', expecting type 'BOOL'"),
+    ],
+)
+def test_what_is_wrong_with_a_parameter_is_said(told: str, said: str) -> None:
+    """A parameter of another type ended the node by a traceback."""
+    command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", "-p", told]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1
-    assert "no.json: cannot be read" in done.stderr
+    assert said in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_colcon_builds_it(tmp_path: Path) -> None:
-    colcon = [str(Path(sys.executable).with_name("colcon")), "build", "--base-paths", str(HERE)]
+def built(tmp_path: Path) -> Path:
+    """Where colcon has installed the package."""
+    here = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    colcon = [shutil.which("colcon", path=here), "build", "--base-paths", str(HERE)]
     places = ("--build-base", tmp_path / "build", "--install-base", tmp_path / "install")
     done = subprocess.run(
         [*colcon, *map(str, places)], capture_output=True, text=True, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
-    built = tmp_path / "install" / "ohmskin_ros"
-    assert (built / "share/ament_index/resource_index/packages/ohmskin_ros").exists()
-    assert (built / "share/ohmskin_ros/launch/skin.launch.py").exists()
-    assert (built / "lib/ohmskin_ros/skin").exists()
+    return tmp_path / "install" / "ohmskin_ros"
+
+
+def test_colcon_builds_it(tmp_path: Path) -> None:
+    installed = built(tmp_path)
+    assert (installed / "share/ament_index/resource_index/packages/ohmskin_ros").exists()
+    assert (installed / "share/ohmskin_ros/launch/skin.launch.py").exists()
+    assert (installed / "lib/ohmskin_ros/skin").exists()
 
 
 def test_the_launch_file_is_python() -> None:
-    """PyPI has no `launch`: it cannot be run here."""
     tree = ast.parse((HERE / "launch/skin.launch.py").read_text())
     assert "generate_launch_description" in {
         node.name for node in tree.body if isinstance(node, ast.FunctionDef)
     }
+
+
+if find_spec("launch_ros"):  # PyPI does not have it: where ROS is sourced
+
+    def test_the_launch_file_starts_a_node(skin_json: Path, tmp_path: Path, reader: Node) -> None:
+        """As `ros2 launch` does it, from what colcon has built; Ctrl-C ends it.
+
+        A frame_id that looks like a number is text all the same.
+        """
+        installed = built(tmp_path)
+        told = {"port": TOUCHED, "calibration": str(skin_json), "frame_id": "42", "name": "tip"}
+        program = f"""
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+source = AnyLaunchDescriptionSource("{installed}/share/ohmskin_ros/launch/skin.launch.py")
+include = IncludeLaunchDescription(source, launch_arguments={list(told.items())})
+service = LaunchService()
+service.include_launch_description(LaunchDescription([include]))
+raise SystemExit(service.run())
+"""
+        sourced = {
+            "AMENT_PREFIX_PATH": installed,
+            "PYTHONPATH": next(installed.glob("lib/python*/site-packages")),
+        }
+        process = subprocess.Popen(
+            [sys.executable, "-c", program],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+            env=os.environ
+            | {name: f"{path}:{os.environ.get(name, '')}" for name, path in sourced.items()},
+        )
+        clouds: list[PointCloud2] = []
+        reader.create_subscription(PointCloud2, "/tip/points", clouds.append, 100)
+        try:
+            until(reader, lambda: len(clouds) >= 10)
+        finally:
+            os.killpg(process.pid, signal.SIGINT)
+            printed, _ = process.communicate(timeout=30)
+        assert process.returncode == 0, printed
+        assert clouds[-1].header.frame_id == "42"
+        assert "[tip]: " + TOUCHED + ": scans come" in printed
+        assert "process has finished cleanly" in printed
 
 
 def test_the_terminal_says_what_is_wrong(skin_json: Path) -> None:
