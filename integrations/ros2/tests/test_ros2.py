@@ -282,9 +282,12 @@ def test_the_terminal_says_what_is_wrong(skin_json: Path) -> None:
         parameters = ("-p", f"calibration:={skin_json}", "-p", f"port:='{port}'")
         command = [sys.executable, "-m", "ohmskin_ros.node", "--ros-args", *parameters]
         process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        time.sleep(10)
+        printed = ""
+        while said not in printed and (line := process.stderr.readline()):
+            printed += line
+        time.sleep(2)  # it is tried again meanwhile
         process.send_signal(signal.SIGINT)
-        _, printed = process.communicate(timeout=30)
+        printed += process.communicate(timeout=30)[1]
         assert printed.count(said) == 1, printed
         assert "Traceback" not in printed
 
