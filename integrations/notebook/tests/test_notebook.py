@@ -38,6 +38,22 @@ def test_every_cell_runs() -> None:
     assert "'force_n': (361, 8, 8)" in shapes or "'force_n': (360, 8, 8)" in shapes
 
 
+def test_it_goes_on_when_the_board_is_plugged_20_times() -> None:
+    """It vanishes 0.3 s after it was opened, and is opened again a second later."""
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    first, live = [cell for cell in notebook.cells if cell.cell_type == "code"][:2]
+    notebook.cells = [first, live]
+    first.source = first.source.replace("&begin=0", "&begin=0&vanish=0.3")
+    live.source = live.source.replace("for _ in range(50):", "while skin.opened <= 20:")
+    live.source += (
+        "\ncount, scans = skin.since(count, timeout_s=30)\nprint(skin.opened, len(scans))"
+    )
+    NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+    (said,) = (out.text for out in live.outputs if out.output_type == "stream")
+    opened, scans = map(int, said.split())
+    assert (opened, scans > 0) == (21, True)
+
+
 def test_with_a_board_only_the_port_changes(tmp_path: Path) -> None:
     """The calibration is that of the folder; what is wrong with the port is said."""
     notebook = nbformat.read(NOTEBOOK, as_version=4)
