@@ -97,6 +97,12 @@ class LiveSkin(Closing):
         self._thread = threading.Thread(target=self._work, name=f"live {port}", daemon=True)
         self._thread.start()
 
+    @property
+    def status(self) -> str:
+        """That scans come, or why there are none, in words."""
+        said = "gives scans" if self._count else "is being opened"
+        return str(self.failure or f"{self.port} {said}")
+
     def newest(self) -> ForceScan | None:
         """The newest scan, at once; None if there is none yet."""
         with self._changed:

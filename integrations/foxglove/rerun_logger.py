@@ -13,18 +13,16 @@ import numpy as np
 import rerun as rr
 
 import ohmskin
+from ohmskin.force.geometry import required
 
 if len(sys.argv) not in (3, 4):
     sys.exit(__doc__)
 port, path, *out = sys.argv[1:]
 try:
     calibration = ohmskin.load_calibration(path)
+    points = required(calibration.geometry).position_m.reshape(-1, 3)
 except ValueError as exc:
     sys.exit(f"rerun_logger: {exc}")
-if calibration.geometry is None:
-    said = "nobody has said where the cells are: ohmskin skin"
-    sys.exit(f"rerun_logger: {path}: {said} {path} --pitch-mm 10,10")
-points = calibration.geometry.position_m.reshape(-1, 3)
 rr.init("ohmskin")
 if out:
     rr.save(out[0])
@@ -37,8 +35,7 @@ with suppress(KeyboardInterrupt), ohmskin.LiveSkin(port, calibration) as skin:
     over = False
     while not over:
         over = skin.ended or isinstance(skin.failure, ValueError)  # then `since` gives the last
-        state = str(skin.failure or f"{port} {'gives scans' if count else 'is being opened'}")
-        if state != said:
+        if (state := skin.status) != said:
             print(said := state, flush=True)
         count, scans = skin.since(count, timeout_s=1.0)
         for scan in scans:

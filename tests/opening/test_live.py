@@ -53,11 +53,14 @@ def test_it_goes_on_when_it_was_unplugged_20_times(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(live, "AGAIN_S", 0.01)
     count = 0
     with LiveSkin(f"{URL}&vanish=0.1", of_scene("ghost")) as skin:
+        assert skin.status == f"{skin.port} is being opened"
         for times in range(1, 21):
             while skin.opened <= times:
                 count, scans = skin.since(count, ENOUGH_S)
                 assert scans, skin.failure
                 assert all(scan.contacts for scan in scans)
+        for said in ("gives scans", "is gone: is the board still plugged in?"):
+            until(lambda said=said: skin.status == f"{skin.port} {said}")
 
 
 def test_a_tare_outlasts_the_plug(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,6 +122,7 @@ def test_a_program_waits_for_what_is_not_there(monkeypatch: pytest.MonkeyPatch) 
         assert skin.since(0)[0] == 0
         while skin.failure is None:
             skin.since(0, 0.01)
+        assert skin.status == "no port /dev/nothing: 'ohmskin ports' lists the ports there are"
         with pytest.raises(DeviceLost, match="is not there: no port /dev/nothing"):
             skin.tare()
     with pytest.raises(ValueError, match=r"no\.json: cannot be read"):

@@ -143,6 +143,13 @@ class Geometry:
             return cls("table", frame_id, rows, columns, told)
 
 
+def required(geometry: Geometry | None) -> Geometry:
+    """The geometry of a calibration. Raises ValueError, which says what to do, if it has none."""
+    if geometry is None:
+        raise ValueError("nobody has said where the cells are: ohmskin skin FILE --pitch-mm 10,10")
+    return geometry
+
+
 def _of_lines(text: str) -> Float:
     """Position and normal of each taxel, (n, 6)."""
     lines = [line.split() for line in text.splitlines() if re.fullmatch(_SIX_NUMBERS, line)]

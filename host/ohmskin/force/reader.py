@@ -30,7 +30,7 @@ from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker, found
 from ohmskin.force.focus import FOLLOWING, Focus
-from ohmskin.force.geometry import Geometry
+from ohmskin.force.geometry import Geometry, required
 from ohmskin.link.codes import quantise
 from ohmskin.link.device import Device, InThreads, Region
 from ohmskin.link.messages import BoardStats, Hello, Scan
@@ -78,13 +78,9 @@ class ForceScan(Scan):
 
         :raises ValueError: there are no forces, or no geometry.
         """
-        if self.geometry is None:
-            if np.isnan(self.force_n).all():
-                raise ValueError("no forces: read scans with a calibration, and by its own method")
-            raise ValueError(
-                "nobody has said where the cells are: 'ohmskin skin FILE --pitch-mm 10,10'"
-            )
-        return self.geometry.wrench(self.force_n)
+        if self.geometry is None and np.isnan(self.force_n).all():
+            raise ValueError("no forces: read scans with a calibration, and by its own method")
+        return required(self.geometry).wrench(self.force_n)
 
     def _repr_html_(self) -> str:
         """A heat map of the forces, in a notebook; of the conductances where there are none."""

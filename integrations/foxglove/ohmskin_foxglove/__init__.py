@@ -35,7 +35,7 @@ from mcap.writer import Writer
 import ohmskin
 from ohmskin.arrays import FULL_SCALE_N, shades
 from ohmskin.files import whole_file
-from ohmskin.force.geometry import Geometry
+from ohmskin.force.geometry import required
 from ohmskin.force.tables import read_forces
 from ohmskin.record.export import Part
 
@@ -60,13 +60,6 @@ _FIELDS = [
 ]
 _STRIDE = 4 * len(NAMES) + len(COLOUR)
 _HERE = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
-
-
-def required(geometry: Geometry | None) -> Geometry:
-    """The geometry of a calibration. Raises ValueError if it has none."""
-    if geometry is None:
-        raise ValueError("nobody has said where the cells are: ohmskin skin FILE --pitch-mm 10,10")
-    return geometry
 
 
 def clouds(scan: ohmskin.ForceScan) -> dict[str, PointCloud]:
@@ -188,9 +181,7 @@ def serve(skin: ohmskin.LiveSkin, port: int = 8765, say: Callable[[str], object]
         while True:
             if isinstance(skin.failure, ValueError):
                 raise skin.failure
-            now = "is being opened" if sent is None else "gives scans"
-            state = str(skin.failure or f"{skin.port} {now}")
-            if state != said:
+            if (state := skin.status) != said:
                 say(said := state)
             time.sleep(0.2)
     except KeyboardInterrupt:

@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 
 import ohmskin
-from ohmskin_foxglove import add_clouds, required, serve
+from ohmskin.force.geometry import required
+from ohmskin_foxglove import add_clouds, serve
 
 
 def main() -> None:

@@ -342,7 +342,7 @@ def test_what_is_missing_is_said(recorded: Path, skin_json: Path, tmp_path: Path
     del content["geometry"]
     bare.write_text(json.dumps(content))
     said = said_by(*LOGGER, URL, bare, tmp_path / "a.rrd")
-    assert said.startswith(f"rerun_logger: {bare}: nobody has said where the cells are: ohmskin")
+    assert said.startswith("rerun_logger: nobody has said where the cells are: ohmskin")
     words = ("-m", "ohmskin_foxglove", "add", recorded, bare, tmp_path / "out.mcap")
     done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True)
     assert done.returncode == 1

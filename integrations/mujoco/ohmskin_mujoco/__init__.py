@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ohmskin
+from ohmskin.force.geometry import required
 
 Float = NDArray[np.float64]
 __all__ = ["Pad"]
@@ -49,14 +50,10 @@ class Pad:
         self._site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
         if self._site < 0:
             raise ValueError(f"the model has no site '{site}'")
-        if calibration.geometry is None:
-            raise ValueError(
-                "nobody has said where the cells are: ohmskin skin FILE --pitch-mm 10,10"
-            )
+        geometry = required(calibration.geometry)
         self._model = model
         self._geoms = np.flatnonzero(model.geom_bodyid == model.site_bodyid[self._site])
-        self._position_m = calibration.geometry.position_m
-        self._normal = calibration.geometry.normal
+        self._position_m, self._normal = geometry.position_m, geometry.normal
         # The distance to the nearest other taxel is that of neighbours, on any surface. Where there
         # is one taxel alone, it gets all of every force.
         taxels = self._position_m.reshape(-1, 3)

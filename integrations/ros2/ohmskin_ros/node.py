@@ -31,6 +31,8 @@ import ohmskin
 from ohmskin.cli.doctor_words import verdict, words_of
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.gather import gather
+from ohmskin.files import naming
+from ohmskin.force.geometry import required
 from ohmskin_ros.messages import header, image, point_cloud, stamp_off_s
 
 # Diagnostics warn where more than this share of the last second's scans was not published. Chosen:
@@ -52,10 +54,8 @@ class SkinNode(Node):
         frame_id = self.declare_parameter("frame_id", "").value
         every = self.declare_parameter("every", True).value
         calibration = ohmskin.load_calibration(path)
-        if calibration.geometry is None:
-            said = "nobody has said where the cells are: ohmskin skin"
-            raise ValueError(f"{path}: {said} {path} --pitch-mm 10,10")
-        self._frame_id = frame_id or calibration.geometry.frame_id
+        with naming(path):
+            self._frame_id = frame_id or required(calibration.geometry).frame_id
         self._points = self.create_publisher(PointCloud2, "~/points", QOS)
         self._image = self.create_publisher(Image, "~/image", QOS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -122,18 +122,18 @@ class SkinNode(Node):
         newest = self.skin.newest()
         if failure is None and not self._thread.is_alive():
             failure = "nothing is published any more (the terminal says why): start the node again"
+        state = str(failure or self.skin.status)
         level, said = DiagnosticStatus.OK, "scanning"
         if failure is not None or newest is None:
-            level, said = DiagnosticStatus.ERROR, str(failure or "no scan yet")
+            level, said = DiagnosticStatus.ERROR, state
         elif newest.estimate.message:
             level, said = DiagnosticStatus.WARN, newest.estimate.message
         elif abs(off_s := stamp_off_s(newest)) > STAMP_OFF_S:
             what = f"stamps and the clock of this machine are {abs(off_s):.1f} s apart"
             why = "it was set after the port was opened (start the node again)"
             level, said = DiagnosticStatus.WARN, f"{what}: {why}, or the port is a recording"
-        state = str(failure or ("is being opened" if newest is None else "scans come"))
         if state != self._state and failure is None:
-            self.get_logger().info(f"{self.skin.port}: {state}")
+            self.get_logger().info(state)
         elif state != self._state:
             self.get_logger().error(state)
         self._state = state

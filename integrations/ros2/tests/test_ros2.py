@@ -268,7 +268,7 @@ raise SystemExit(service.run())
             printed, _ = process.communicate(timeout=30)
         assert process.returncode == 0, printed
         assert clouds[-1].header.frame_id == "42"
-        assert "[tip]: " + TOUCHED + ": scans come" in printed
+        assert "[tip]: " + TOUCHED + " gives scans" in printed
         assert "process has finished cleanly" in printed
 
 
