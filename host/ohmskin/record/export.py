@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from shutil import copyfileobj
@@ -152,11 +151,12 @@ def save_readings(part: Part, out: Path) -> None:
     :raises ValueError: `out` cannot be written.
     """
     save = _save_csv if out.suffix == ".csv" else _save_npz
-    names = {*next(iter(part)).reading_names}
+    first = next(iter(part))
+    size, names = first.codes.shape[:2], {*first.reading_names}
     while True:
         in_order = next((of for of in MODES.values() if {*of} == names), tuple(sorted(names)))
         try:
-            return save(part, out, in_order)
+            return save(part, out, size, in_order)
         except _MoreNames as more:
             names |= more.names
 
@@ -183,19 +183,15 @@ def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArr
     return widened
 
 
-def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
+def _save_npz(part: Part, out: Path, size: tuple[int, ...], names: tuple[str, ...]) -> None:
     """Write a readings file that also has the arrays of `_OF_SCAN`.
 
     Its `rest_ratio` is the last tare before the last scan that is good for it.
     """
-    scans = iter(part)
-    first = next(scans)
-    size = first.codes.shape[:2]
+    scan_bytes = _RATIO.itemsize * math.prod(size) * len(names)
+    most = min(MAX_FRAMES, MAX_ARRAY_BYTES // scan_bytes)
     with whole_file(out) as file, Stacks(out.parent) as stacks:
-        most = min(
-            MAX_FRAMES, MAX_ARRAY_BYTES // (_RATIO.itemsize * size[0] * size[1] * len(names))
-        )
-        for scan in chain([first], scans):
+        for scan in part:
             if part.scans > most:
                 many = f"{part.scans} scans are more than a readings file holds"
                 raise part.error(f"{many}: export a part of them")
@@ -215,15 +211,12 @@ def _save_npz(part: Part, out: Path, names: tuple[str, ...]) -> None:
         stacks.save(file, more)
 
 
-def _save_csv(part: Part, out: Path, names: tuple[str, ...]) -> None:
+def _save_csv(part: Part, out: Path, size: tuple[int, ...], names: tuple[str, ...]) -> None:
     """Write a table with a row for each scan: its times, then the codes of its cells.
 
     Columns of codes are named by row, column and reading.
     """
-    scans = iter(part)
-    first = next(scans)
-    cells = np.ndindex(*first.codes.shape[:2])
-    columns = [f"r{row}c{column}{name}" for row, column in cells for name in names]
+    columns = [f"r{row}c{column}{name}" for row, column in np.ndindex(size) for name in names]
     times = attrgetter(*_OF_SCAN)
 
     def row(scan: Scan) -> list[Any]:
@@ -232,4 +225,4 @@ def _save_csv(part: Part, out: Path, names: tuple[str, ...]) -> None:
             codes = ["" if math.isnan(code) else int(code) for code in codes]
         return [*times(scan), *codes]
 
-    save_table(out, [*_OF_SCAN, *columns], map(row, chain([first], scans)))
+    save_table(out, [*_OF_SCAN, *columns], map(row, part))
