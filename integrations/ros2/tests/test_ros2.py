@@ -260,9 +260,13 @@ raise SystemExit(service.run())
             | {name: f"{path}:{os.environ.get(name, '')}" for name, path in sourced.items()},
         )
         clouds: list[PointCloud2] = []
+        states: list[str] = []
         reader.create_subscription(PointCloud2, "/tip/points", clouds.append, 100)
-        try:
-            until(reader, lambda: len(clouds) >= 10)
+        reader.create_subscription(
+            DiagnosticArray, "/diagnostics", lambda each: states.append(each.status[0].message), 10
+        )
+        try:  # the terminal is told before the diagnostics
+            until(reader, lambda: len(clouds) >= 10 and "scanning" in states)
         finally:
             os.killpg(process.pid, signal.SIGINT)
             printed, _ = process.communicate(timeout=30)
