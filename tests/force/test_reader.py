@@ -59,6 +59,19 @@ def test_scans_carry_forces_and_contacts(method: str) -> None:
         assert centres == set(map(tuple, np.argwhere(true_n > 0).astype(float).tolist()))
 
 
+def test_a_cell_without_a_curve_of_its_own_has_the_hidden_wires_of_others() -> None:
+    """Of this skin, presses were told twice the wires, and no cell has a curve of its own."""
+    wires = WireOhm(2 * TOP_WIRE_OHM, 2 * BOTTOM_WIRE_OHM, 80.0, 0.7, 0.7, 20.0)
+    of_skin = replace(of_scene("ghost", method="joint"), nominal_wire_ohm=wires)
+    assert of_skin.model.pooled.all()
+    with ohmskin.open(GHOST, calibration=of_skin) as board:
+        *_, scan = islice(board, 20)
+    level, _ = of_skin.level(scan.estimate)
+    expected_n = np.maximum(level - of_skin.rest.level, 0.0) / NEWTON_SIEMENS
+    np.testing.assert_allclose(scan.force_n, expected_n, atol=1e-9)
+    assert np.abs(scan.estimate.level / level - 1).max() > 0.01
+
+
 def test_voltage_is_a_method() -> None:
     assert "voltage" in LEVEL_METHODS
     of_skin = of_scene("ghost", method="voltage", siemens=0.1)

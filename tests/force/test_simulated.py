@@ -10,6 +10,7 @@ import pytest
 import ohmskin
 from calibrations import NEWTON_SIEMENS, of_scene
 from ohmskin.arrays import Float
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.curve import POWER
 
 
@@ -61,6 +62,15 @@ def test_its_skin_is_that_of_the_calibration() -> None:
     scan = skin.step(force_n, 0.0)
     rest = skin.calibration.untouched.level[2, 5]
     assert scan.estimate.cell_siemens[2, 5] - rest == pytest.approx(NEWTON_SIEMENS, rel=0.02)
+
+
+def test_its_wires_are_those_of_the_curves() -> None:
+    """Others were learned since the presses."""
+    wires = WireOhm(250.0, 500.0, 80.0, 0.05, 0.05, 20.0, 100.0, 200.0, 80.0)
+    skin = ohmskin.SimulatedSkin(replace(of_scene("rest"), nominal_wire_ohm=wires))
+    read_n = [skin.step(fingertip(6.0), 0.01 * k).force_n.sum() for k in range(10)]
+    assert read_n == pytest.approx(10 * [6.0], rel=0.03)
+    assert skin.calibration.nominal_wire_ohm.both == (100.0, 200.0)
 
 
 def test_it_is_read_in_real_time() -> None:

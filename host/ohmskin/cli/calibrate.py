@@ -350,7 +350,9 @@ def _knead(
         said = {"left_out": [span for _, *span in left_out], "lag_s": lag_s, "offset_s": offset_s}
         said |= {"wrong_numbers": int(wrong.sum())}
         said |= {"presses": fit.presses, "gain_std": stds.reshape(kneading.shape).tolist()}
-        print(json.dumps(said | calibration.nominal_wire_ohm._asdict()))  # noqa: T201
+        names = WireOhm._fields[:6]
+        said |= zip(names, calibration.nominal_wire_ohm, strict=False)
+        print(json.dumps(said))  # noqa: T201
         return
     lag = f"the scale lags by {1000 * lag_s:.0f} ms"
     fewer = f"{_presses(fit.presses_left_out)} left out"

@@ -19,7 +19,7 @@ from ohmskin.circuit.configurations import NEAR, is_near, ratio_from_current
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.port_readings import PortReader, PortReadings
-from ohmskin.estimate.prior import REACH_STDS
+from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS, REACH_STDS
 
 # The conductance of a touched cell has risen by more than this. Chosen: half of what a cell of one
 # megohm conducts at rest, so that a drift by some percent is no touch.
@@ -112,7 +112,7 @@ class Solution:
     wire_ohm: segments of top and bottom layer (2, R, C) [ohm]; None: not estimated.
     wire_ohm_std: their standard deviation (2, R, C) [ohm]; None: not known.
     cell_siemens_std_down: standard deviation of errors downwards (R, C) [S]; None: as upwards.
-    level: as in `Estimate`; None: cell_siemens.
+    level, level_std: as in `Estimate`; None: cell_siemens and its deviation.
     """
 
     cell_siemens: Float
@@ -124,6 +124,16 @@ class Solution:
     wire_ohm_std: Float | None = None
     cell_siemens_std_down: Float | None = None
     level: Float | None = None
+    level_std: Float | None = None
+
+
+def in_series(cell_ohm: Float, hidden_ohm: Float | float) -> Float:
+    """Conductance [S] of cells in series with wires that are a part of their curves.
+
+    Such wires may be below 0, if more were told. No touch conducts more than the hardest for that.
+    """
+    least_ohm = np.minimum(cell_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
+    return np.asarray(1.0 / np.maximum(cell_ohm + hidden_ohm, least_ohm))
 
 
 class Estimator(ABC):
@@ -251,10 +261,9 @@ class Estimator(ABC):
 
     def _level(self, ratio: Float, solution: Solution) -> tuple[Float, Float]:
         """`Estimate.level` of readings (R, C, 4) that gave this solution, and its deviation."""
-        if solution.level is None:
+        if solution.level is None or solution.level_std is None:
             return solution.cell_siemens, solution.cell_siemens_std
-        share = solution.level / solution.cell_siemens
-        return solution.level, share**2 * solution.cell_siemens_std  # their resistances differ
+        return solution.level, solution.level_std
 
     def _touched(self, solution: Solution) -> Bool:
         """Which cells are touched, by the rule of `estimate`.

@@ -24,7 +24,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from ohmskin.arrays import Float
-from ohmskin.estimate.base import ASSUMED, Estimator, Solution
+from ohmskin.estimate.base import ASSUMED, Estimator, Solution, in_series
 from ohmskin.estimate.far_wires import MeasuredWires
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, SkinKnowledge, WireOhm
@@ -131,6 +131,8 @@ class JointEstimator(Estimator):
         # cells.
         self._rest_wires_log_std = 0.0
         self._is_damp = False
+        # Of the last whole frame, and of the regions since, (RC,).
+        self._hidden_ohm: Float
         self.reset()
 
     def wires(self) -> WireOhm:
@@ -306,15 +308,24 @@ class JointEstimator(Estimator):
         wires = belief.believed_wires()
         if isinstance(fit, FullFit):
             wires = belief.wires(fit.wires, fit.means)
-        stds = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std, belief.stds()
+        parts = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
-        std, std_down = siemens_std(-fit.log_cells, *stds, series_ohm)
+        std, std_down = siemens_std(-fit.log_cells, *parts, belief.stds(), series_ohm)
         # Where the model misses the readings by more than their noise, or by more than it expects
         # to, it is wrong somewhere. So all variances are widened by the ratio.
         wider = max(1.0, fit.misfit, fit.surprise) ** 0.5
         cell_ohm = np.exp(fit.log_cells)
-        # At least half of the cell: what wires lack must not make it negative.
-        level = 1.0 / np.maximum(cell_ohm + wires.hidden_path_ohm, 0.5 * cell_ohm)
+        if isinstance(fit, RegionFit):  # outside, all stays as in the whole frame
+            self._hidden_ohm = self._hidden_ohm.copy()
+            self._hidden_ohm[ports.region] = wires.hidden_path_ohm[ports.region]
+        else:
+            self._hidden_ohm = wires.hidden_path_ohm
+        level = in_series(cell_ohm, self._hidden_ohm)
+        level_std = std
+        if any(belief.told.told_share):
+            parts = belief.parts_of_level(*parts)
+            level_std, _ = siemens_std(-fit.log_cells, *parts, belief.stds(), series_ohm)
+        level_std = level_std * (level * cell_ohm) ** 2  # cell and level have the same error in ohm
         return Solution(
             cell_siemens=(1.0 / cell_ohm).reshape(self._shape),
             cell_siemens_std=wider * std.reshape(self._shape),
@@ -325,6 +336,7 @@ class JointEstimator(Estimator):
             wire_ohm=wires.segment_ohm,
             wire_ohm_std=wires.segment_std_ohm,
             level=level.reshape(self._shape),
+            level_std=wider * level_std.reshape(self._shape),
         )
 
     def _doubt(self, prior: CellPrior, fit: FullFit) -> str:

@@ -20,7 +20,13 @@ from ohmskin.circuit.configurations import (
     current_std,
     is_near,
 )
-from ohmskin.estimate.prior import LAYER_STD, LEAD_STD, UNKNOWN_LEAD_OHM, USUAL_LEAD_STD_OHM
+from ohmskin.estimate.prior import (
+    LAYER_STD,
+    LEAD_STD,
+    UNKNOWN_LEAD_OHM,
+    UNKNOWN_WIRE_OHM,
+    USUAL_LEAD_STD_OHM,
+)
 from ohmskin.link.codes import check_adc_bits, ratio_std
 from ohmskin.link.messages import Hello
 from ohmskin.link.protocol import MODES
@@ -31,6 +37,8 @@ MIN_CELL_SIEMENS: Final = 1e-9
 # Chosen: usual resistors are within 1 % (E96), and the pins that drive them add less than that:
 # some 30 ohm to 30 kOhm.
 REF_LOG_STD: Final = 0.01
+# Wires of less count as so much [ohm]. Chosen: its log is finite, and no reading shows it.
+LEAST_WIRE_OHM: Final = 1e-3
 # A shorted cell counts as so much [S]. Chosen: beside references of 30 kOhm, an ohm is nothing.
 MAX_CELL_SIEMENS: Final = 1.0
 
@@ -44,8 +52,8 @@ class WireOhm(NamedTuple):
         for all lines alike [ohm]; 0: nothing.
     top_log_std, bottom_log_std: standard deviations of the logs of these, where they were measured.
     lead_std_ohm: the same of the lead [ohm]. A lead may be next to nothing, which has no log.
-    curve_top, curve_bottom, curve_lead: what curves of presses take the wires for [ohm], if others
-        have been learned since the presses; None: top, bottom and lead.
+    curve_top, curve_bottom, curve_lead: the wires that the levels of the curves were computed with
+        [ohm], if others have been learned since; None: top, bottom and lead.
     """
 
     top: float | None = None
@@ -63,6 +71,8 @@ class WireOhm(NamedTuple):
         for name, number in zip(WIRE_FIELDS, self, strict=True):
             if number is not None and not 0 <= number <= MAX_OHM:
                 raise ValueError(f"{name} is {number:g}, it must be from 0 to {MAX_OHM:g}")
+        if any(number is not None for number in self[6:]) and None in (*self[:2], *self[6:]):
+            raise ValueError(f"{', '.join(WIRE_FIELDS[6:])} need each other, and both layers")
         return self
 
     def lead_or_usual(self, std_ohm: float) -> tuple[float, float]:
@@ -98,34 +108,37 @@ class WireOhm(NamedTuple):
         """How much of a difference from top, bottom and lead was there when they were told [1].
 
         Layers differ because they were told wrongly, by their deviation, or because the skin has
-        been stretched since, by `LAYER_STD`. Leads do not stretch. Where nobody has told layers, it
-        is 0.
+        been stretched since, by `LAYER_STD`. Leads do not stretch. What has no deviation counts as
+        told rightly: no press has measured it. Where nobody has told layers, all count so.
         """
         if self.both is None:
             return 0.0, 0.0, 0.0
         top, bottom = ((std or 0.0) ** 2 for std in self[3:5])
-        return top / (top + LAYER_STD**2), bottom / (bottom + LAYER_STD**2), 1.0
+        lead = 0.0 if self.lead_std_ohm is None else 1.0
+        return top / (top + LAYER_STD**2), bottom / (bottom + LAYER_STD**2), lead
 
-    @property
-    def of_curves(self) -> "WireOhm":
-        """These wires as curves of presses take them."""
-        both = zip(self[:3], self[6:], strict=True)
-        top, bottom, lead = (own if curve is None else curve for own, curve in both)
-        return WireOhm(top, bottom, lead, *self[3:6])
+    def of_curves(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
+        """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
+
+        A press alone shows a cell and the wires up to it as one. So what wires were told wrongly by
+        is in the curves of cells. What the skin was stretched by since is not.
+        """
+        layers = []
+        for told, curve, share, ohm in zip(self[:2], self[6:8], self.told_share, now, strict=False):
+            told_ohm = max(UNKNOWN_WIRE_OHM if told is None else told, LEAST_WIRE_OHM)
+            curve_ohm = told_ohm if curve is None else max(curve, LEAST_WIRE_OHM)
+            layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** (1.0 - share))
+        told_ohm, _ = self.lead_or_usual(0.0)
+        curve_ohm = told_ohm if self.curve_lead is None else self.curve_lead
+        lead = curve_ohm + (1.0 - self.told_share[2]) * (now[2] - told_ohm)
+        return layers[0], layers[1], max(lead, 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
-        """These wires, which were learned later, for curves of presses that were told `before`.
-
-        A press alone shows a cell and the wires up to it as one. So what `before` was wrong by is
-        in the curves. What the skin was stretched by since is not (`told_share`).
-        """
-        curve = before.of_curves
-        if self is before or self.both is None or before.both is None or curve.both is None:
+        """These wires, which were learned later, for curves of presses that were told `before`."""
+        if self is before or self.both is None or before.both is None:
             return self
-        moved = np.maximum(self.both, 1e-3) / np.maximum(before.both, 1e-3)
-        top, bottom = curve.both * moved ** (1.0 - np.array(before.told_share[:2]))
-        lead, _ = curve.lead_or_usual(0.0)
-        return self._replace(curve_top=float(top), curve_bottom=float(bottom), curve_lead=lead)
+        top, bottom, lead = before.of_curves((*self.both, self.lead_or_usual(0.0)[0]))
+        return self._replace(curve_top=top, curve_bottom=bottom, curve_lead=lead)
 
     @property
     def both(self) -> tuple[float, float] | None:

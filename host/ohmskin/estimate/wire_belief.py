@@ -52,7 +52,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.skin import incidence
 from ohmskin.circuit.small import solve_lower
-from ohmskin.estimate.knowledge import WireOhm
+from ohmskin.estimate.knowledge import LEAST_WIRE_OHM, WireOhm
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     LAYER_STD,
@@ -77,12 +77,6 @@ MOST_FITS: Final = 4
 LOWEST_LEAK_US: Final = -0.1
 
 CircuitT = TypeVar("CircuitT", bound=PortCircuit)
-
-
-def _means_of(wires: WireOhm) -> Float:
-    """Logs of both layers, and the lead, (3,): the usual ones where nobody has told them."""
-    layers = [UNKNOWN_WIRE_OHM if ohm is None else max(ohm, 1e-3) for ohm in wires[:2]]
-    return np.array([*np.log(layers), wires.lead_or_usual(0.0)[0]])
 
 
 class Lesson(NamedTuple):
@@ -151,6 +145,7 @@ class WireBelief(ABC):
 
     shape: (rows, columns).
     far: whether rows, and columns, are sensed at their far ends.
+    told: what was known of them before any frame.
     means: m, (n,). It is replaced when the belief changes, and never written into.
     untold: whether nobody told them, and not both far ends measure them.
     leads_of_ports: which leads are in the readings of each port: those of its lines that are sensed
@@ -170,7 +165,7 @@ class WireBelief(ABC):
         wires: what is known of them.
         may_be_bent: whether the skin may have been bent since they were measured.
         """
-        self.shape, self.far, self._may_be_bent = shape, far, may_be_bent
+        self.shape, self.far, self.told, self._may_be_bent = shape, far, wires, may_be_bent
         rows, columns = shape
         self.leads_of_ports: Float = np.abs(incidence(rows, columns)) * ~np.repeat(far, shape)
         # How many top segments, bottom segments and leads are up to each cell, (3, RC).
@@ -186,7 +181,8 @@ class WireBelief(ABC):
         if may_be_bent or not layer_stds.all():
             layer_stds = np.hypot(layer_std, layer_stds)
         layer_stds = np.maximum(layer_stds, 0.01)
-        lead_std_ohm = max(wires.lead_or_usual(UNKNOWN_LEAD_STD_OHM)[1], 1e-3)
+        lead_ohm, lead_std_ohm = wires.lead_or_usual(UNKNOWN_LEAD_STD_OHM)
+        lead_std_ohm = max(lead_std_ohm, 1e-3)
         self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
         # Where each line's own lead is in m.
         self._of_lines = slice(3, 3 + rows + columns)
@@ -194,11 +190,10 @@ class WireBelief(ABC):
         self._of_leaks = self._of_segments = slice(3 + rows + columns, 3 + rows + columns)
         own = np.full(rows + columns, SEGMENT_STD)
         self._prior_covariance = np.diag([*layer_stds, lead_std_ohm, *own]) ** 2
-        told = _means_of(wires)
-        self._nominal: Float = np.concatenate([told, np.zeros(rows + columns)])
-        # What curves take for the first three of m follows these by a share, and begins here.
-        self._curve_share = 1.0 - np.array(wires.told_share)
-        self._curve_means = _means_of(wires.of_curves) - self._curve_share * told
+        nominal = [
+            UNKNOWN_WIRE_OHM if ohm is None else max(ohm, LEAST_WIRE_OHM) for ohm in wires[:2]
+        ]
+        self._nominal: Float = np.array([*np.log(nominal), lead_ohm, *np.zeros(rows + columns)])
         self.reset()
 
     def expect_leaks(self, leaks_us: Float, stds_us: Float) -> None:
@@ -470,8 +465,8 @@ class WireBelief(ABC):
         segments = self.segment_ohm(wires)
         leads = np.maximum(wires[segments.size :], 0.0)
         path_ohm = self._path_ohm(segments, leads)
-        curve = self._curve_means + self._curve_share * means[:3]
-        curve_ohm = np.array([*np.exp(curve[:2]), max(float(curve[2]), 0.0)])
+        top_ohm, bottom_ohm = np.exp(means[:2]).tolist()
+        curve_ohm = self.told.of_curves((top_ohm, bottom_ohm, float(means[2])))
         hidden_ohm = path_ohm - curve_ohm @ self._wires_of_paths
         return SkinWires(segments, segments * self.segment_std(), path_ohm, hidden_ohm)
 
@@ -482,6 +477,19 @@ class WireBelief(ABC):
         by_top, by_bottom = (0.0 if is_far else 1.0 for is_far in self.far)
         path = by_top * segments[0].cumsum(axis=1) + by_bottom * segments[1].cumsum(axis=0)
         return np.asarray(path.ravel() + self.leads_of_ports @ leads)
+
+    def parts_of_level(
+        self, log_std: Float, wires_log_std: Float, leads_log_std: Float
+    ) -> tuple[Float, Float, Float]:
+        """The same without what wires were told wrongly by: a level has no error of that.
+
+        log_std, wires_log_std, leads_log_std: as `prior.siemens_std` takes them, (RC,).
+        """
+        top, bottom, lead = self.told.told_share
+        layers = min(top, bottom)
+        gone = layers * wires_log_std**2 + lead * leads_log_std**2
+        own = np.sqrt(np.maximum(log_std**2 - gone, 0.0))
+        return own, (1.0 - layers) ** 0.5 * wires_log_std, (1.0 - lead) ** 0.5 * leads_log_std
 
     def believed_wires(self) -> SkinWires:
         """The wires as believed, for answers whose fit took them so: made once for each belief."""

@@ -36,8 +36,8 @@ kind                     R, C              "linear" or "power"
 slope, slope_std, ...    R, C              the other arrays of `ForceModel`; null where it has NaN
 ======================== ================= ======================================================
 
-Forces are `Calibration.forces` of levels above `untouched.level`. Numbers are read back bit for
-bit.
+Forces are `Calibration.forces` of `Calibration.level` above `untouched.level`. Numbers are read
+back bit for bit.
 
 A file may come from somebody else. So its size is checked before it is read, its fields and their
 types and shapes before anything is made of them, and their ranges when the objects are made.
@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.configurations import READINGS_PER_CELL, is_near
-from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.base import Estimate, in_series
 from ohmskin.estimate.knowledge import NO_WIRES, WIRE_FIELDS, SkinKnowledge, WireOhm, check_ratio
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
@@ -212,19 +212,22 @@ class Calibration:
             remedy = f"calibrate this skin, or {told} if it is that one, with a new board"
             raise ValueError(f"this calibration is of {units}: {remedy}")
 
-    def level(self, estimate: Estimate) -> Float:
-        """What the forces of a frame are read from, (R, C): `Estimate.level`, with one exception.
+    def level(self, estimate: Estimate) -> tuple[Float, Float]:
+        """What the forces of a frame are read from, and its deviation, (R, C).
 
-        Curves of cells that were pressed alone have wires in them that presses do not show. The
-        curve of all presses has those of the cells that were pressed, on average. So for a cell
-        that has no curve of its own, these take the place of its own such wires.
+        It is `Estimate.level`, with one exception. The curve of a cell has wires in it that presses
+        do not show: the hidden ones. The curve of all presses has those of the pressed cells, on
+        average. So for a cell without a curve of its own, the mean of the cells that have one takes
+        the place of its own hidden wires; if no cell has one, the mean of all.
         """
-        level, siemens, pooled = estimate.level, estimate.cell_siemens, self.model.pooled
-        if not estimate.wires or not pooled.any() or pooled.all():
-            return level
-        hidden_ohm = float(np.mean(1.0 / level[~pooled] - 1.0 / siemens[~pooled]))
-        in_series = 1.0 / np.maximum(1.0 / siemens + hidden_ohm, 0.5 / siemens)
-        return np.where(pooled, in_series, level)
+        level, level_std, pooled = estimate.level, estimate.level_std, self.model.pooled
+        if not estimate.wires or not pooled.any():
+            return level, level_std
+        cell_ohm = estimate.cell_ohm
+        hidden_ohm = (1.0 / level - cell_ohm)[pooled == pooled.all()]
+        of_all = in_series(cell_ohm, float(hidden_ohm.mean()))
+        std = np.where(pooled, (of_all / level) ** 2, 1.0) * level_std
+        return np.where(pooled, of_all, level), std
 
     def forces(self, rise: Float, rise_std: Float, touched: Bool) -> tuple[Float, Float]:
         """Force and its standard deviation [N], (..., R, C), of what cells show, in any scans.

@@ -344,13 +344,10 @@ class SkinReader:
         scans: one or more. Raises what `read` does.
         """
         method = self._wanted
-        pairs = [self._estimated(scan, method) for scan in scans]
-        estimates = [estimate for estimate, _ in pairs]
-        rises = np.array([rise for _, rise in pairs])
-        stds, touched = (
-            np.array([getattr(estimate, name) for estimate in estimates])
-            for name in ("level_std", "touched")
-        )
+        estimated = [self._estimated(scan, method) for scan in scans]
+        estimates = [estimate for estimate, _, _ in estimated]
+        rises, stds = (np.array([each[k] for each in estimated]) for k in (1, 2))
+        touched = np.array([estimate.touched for estimate in estimates])
         calibration, geometry = self._shared.calibration, None
         if calibration is not None and self.has_forces:
             geometry = calibration.geometry
@@ -362,8 +359,8 @@ class SkinReader:
         of_scans = zip(scans, estimates, *forces, found(touched, *of_contacts), strict=True)
         return [self._shown(*of_scan, geometry) for of_scan in of_scans]
 
-    def _estimated(self, scan: Scan, method: str) -> tuple[Estimate, Float]:
-        """The estimate by this method, and its rise above rest (R, C)."""
+    def _estimated(self, scan: Scan, method: str) -> tuple[Estimate, Float, Float]:
+        """The estimate by this method, its rise above rest, and the rise's deviation, (R, C)."""
         self.check_mode(scan.mode)
         if scan.rest_ratio is not None:
             self._shared.take_recorded(scan.rest_ratio)
@@ -374,8 +371,10 @@ class SkinReader:
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
         at_rest = np.median(estimate.level) if self._rest_level is None else self._rest_level
         calibration = self._shared.calibration if method == self.force_method else None
-        level = estimate.level if calibration is None else calibration.level(estimate)
-        return estimate, np.asarray(level - at_rest)
+        level, level_std = estimate.level, estimate.level_std
+        if calibration is not None:
+            level, level_std = calibration.level(estimate)
+        return estimate, np.asarray(level - at_rest), level_std
 
     def _shown(
         self,

@@ -20,6 +20,7 @@ from ohmskin.emulate.driver import EmulatorLink
 from ohmskin.emulate.faults import SkinFaults
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, LEAD_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
@@ -55,7 +56,9 @@ class SimulatedSkin:
                 "a calibration by 'voltage' knows no conductances: take another method"
             )
         rows, columns, wires = calibration.rows, calibration.columns, calibration.nominal_wire_ohm
-        wires = wires.of_curves  # the cells below are those of the curves
+        if wires.curve_top is not None and calibration.mode != "far":
+            # Its cells are those of the curves, and so are the wires up to them.
+            wires = WireOhm(*wires[6:], *wires[3:6])
         told = (wires.top, TOP_WIRE_OHM), (wires.bottom, BOTTOM_WIRE_OHM), (wires.lead, LEAD_OHM)
         top, bottom, lead = (usual if known is None else known for known, usual in told)
         drawn = Scene("rest", rows, columns, seed=seed).rest
