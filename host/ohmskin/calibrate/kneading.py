@@ -229,7 +229,9 @@ class Kneading:
             for n, scan in given:
                 answer = estimator.estimate(scan.ratio)
                 good[n], rise[n] = answer.converged, answer.level.ravel() - rest
-            wires = estimator.wires().for_curves_of(wires)
+            # Levels of all recordings are of one curve. What far ends show is no part of it.
+            learned = estimator.wires()
+            wires = learned if self._calibrator.shows_wires else learned.for_curves_of(wires)
         of_nothing = rise[good & wanted & ~pressed].max(axis=1, initial=0.0)
         least = PAUSE_TIMES * float(np.median(of_nothing)) if of_nothing.size else 0.0
         rise[(rise < min(least, TOUCH_SIEMENS)) | ~pressed[:, None]] = 0.0
