@@ -25,6 +25,20 @@ def test_factors_solve_what_numpy_solves(order: str) -> None:
     np.testing.assert_allclose(transposed, np.linalg.solve(lower.T, right))
 
 
+@pytest.mark.parametrize("transposed", [False, True])
+def test_a_factor_of_several_blocks_solves_what_numpy_solves(transposed: bool) -> None:
+    random = np.random.default_rng(3)
+    rows, right = random.normal(size=(150, 160)), random.normal(size=(150, 7))
+    kept, lower = right.copy(), np.linalg.cholesky(rows @ rows.T)
+    factor = cholesky(gram(rows))
+    expected = np.linalg.solve(lower.T if transposed else lower, right)
+    solution = solve_lower(factor, right, transposed=transposed)
+    np.testing.assert_allclose(solution, expected, rtol=1e-6)
+    wider = np.hstack([right, right])[:, :7]  # not in one piece
+    np.testing.assert_array_equal(solve_lower(factor, wider, transposed=transposed), solution)
+    np.testing.assert_array_equal(right, kept)
+
+
 def test_gram_adds_lower_triangles() -> None:
     random = np.random.default_rng(2)
     one, two = random.normal(size=(4, 6)), random.normal(size=(4, 3))

@@ -8,13 +8,16 @@ there may be anything.
 
 import threading
 from contextlib import ContextDecorator
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy.linalg import blas, lapack
 from threadpoolctl import ThreadpoolController
 
 from ohmskin.arrays import Float
+
+# Rows of a block of `solve_lower`. Chosen: 32 to 96 are about as fast.
+_BLOCK: Final = 64
 
 
 def gram(rows: Float, onto: Float | None = None) -> Float:
@@ -75,9 +78,21 @@ def solve_lower(factor: Float, right: Float, *, transposed: bool = False) -> Flo
         solution, failed = lapack.dtrtrs(factor, right, lower=1, trans=int(transposed))
         _check(failed)
         return np.asarray(solution)
-    # x^T L^T = right^T: in C's order nothing is turned around, which saves a third of the time.
-    turned = blas.dtrsm(1.0, factor, right.T, side=1, lower=1, trans_a=int(not transposed))
-    return np.asarray(turned.T)
+    # In C's order, x^T of x^T L^T = right^T is in Fortran's: nothing is turned around, which saves
+    # a third of the time.
+    side = {"side": 1, "lower": 1, "trans_a": int(not transposed)}
+    if len(factor) <= _BLOCK:
+        return np.asarray(blas.dtrsm(1.0, factor, right.T, **side).T)
+    # In blocks of rows, most of the work is products, which are twice as fast.
+    solution = np.array(right, np.float64, order="C")
+    blocks = [slice(first, first + _BLOCK) for first in range(0, len(factor), _BLOCK)]
+    for block in reversed(blocks) if transposed else blocks:
+        if transposed:
+            solution[block] -= factor[block.stop :, block].T @ solution[block.stop :]
+        else:
+            solution[block] -= factor[block, : block.start] @ solution[: block.start]
+        blas.dtrsm(1.0, factor[block, block], solution[block].T, overwrite_b=1, **side)
+    return solution
 
 
 def _check(failed: int) -> None:
