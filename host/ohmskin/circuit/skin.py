@@ -108,23 +108,28 @@ def incidence(rows: int, columns: int) -> Float:
 
 
 @lru_cache(maxsize=8)
-def _unit_coupling(rows: int, columns: int) -> tuple[Float, Float]:
-    """K of a skin with 1 ohm in each top segment alone, and in each bottom segment alone."""
+def _unit_coupling(
+    rows: int, columns: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Float, Float]:
+    """Pairs of cells that share wire, (2, k), and flat indices of their elements in K, (k,); and
+    these of a skin with 1 ohm in each top segment alone, and in each bottom segment alone, (k,).
+    """
     shape = rows, columns
-    ones, zeros = np.ones(shape), np.zeros(shape)
-    return wire_coupling_ohm(ones, zeros, shape), wire_coupling_ohm(zeros, ones, shape)
+    by_top, by_bottom = wire_coupling_ohm(1.0, 0.0, shape), wire_coupling_ohm(0.0, 1.0, shape)
+    pairs = np.nonzero(by_top + by_bottom)
+    flat = np.ravel_multi_index(pairs, by_top.shape)
+    return np.array(pairs), flat, by_top[pairs], by_bottom[pairs]
 
 
 def wire_coupling_ohm(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, int]) -> Float:
     """K [ohm], shape (RC, RC): K[e, f] is the wire shared by the paths to cells e and f."""
     rows, columns = shape
-    if isinstance(top_wire_ohm, float) and isinstance(bottom_wire_ohm, float):
-        by_top, by_bottom = _unit_coupling(rows, columns)
-        return np.asarray(top_wire_ohm * by_top + bottom_wire_ohm * by_bottom)
+    to_top = np.cumsum(np.broadcast_to(top_wire_ohm, shape), 1)
+    to_bottom = np.cumsum(np.broadcast_to(bottom_wire_ohm, shape), 0)
     i, j = np.arange(rows), np.arange(columns)
     coupling = np.zeros((rows, columns, rows, columns))
-    np.einsum("ijik->ijk", coupling)[:] = np.cumsum(top_wire_ohm, 1)[:, np.minimum.outer(j, j)]
-    np.einsum("ijkj->ikj", coupling)[:] += np.cumsum(bottom_wire_ohm, 0)[np.minimum.outer(i, i)]
+    np.einsum("ijik->ijk", coupling)[:] = to_top[:, np.minimum.outer(j, j)]
+    np.einsum("ijkj->ikj", coupling)[:] += to_bottom[np.minimum.outer(i, i)]
     return coupling.reshape(rows * columns, rows * columns)
 
 
@@ -138,10 +143,18 @@ def factorised(
     root: sqrt(g), (R, C).
     to_sense: F (RC, R+C); None: near ends are sensed, and "half" has no columns of F.
     """
-    system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm, root.shape)
-    system *= root.reshape(-1, 1)
-    system *= root.reshape(1, -1)
-    system.ravel()[:: len(system) + 1] += 1.0
+    cells, roots = root.size, root.ravel()
+    if isinstance(top_wire_ohm, float) and isinstance(bottom_wire_ohm, float):
+        # Only cells of a line share wire: most elements are 0.
+        pairs, flat, by_top, by_bottom = _unit_coupling(*root.shape)
+        one, other = roots[pairs]
+        system = np.zeros((cells, cells))
+        system.ravel()[flat] = (top_wire_ohm * by_top + bottom_wire_ohm * by_bottom) * one * other
+    else:
+        system = wire_coupling_ohm(top_wire_ohm, bottom_wire_ohm, root.shape)
+        system *= roots[:, None]
+        system *= roots
+    system.ravel()[:: cells + 1] += 1.0
     factor, ends = cholesky(system), incidence(*root.shape)
     if to_sense is not None:
         ends = np.hstack([ends, to_sense])
