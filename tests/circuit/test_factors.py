@@ -44,6 +44,8 @@ def test_gram_adds_lower_triangles() -> None:
     one, two = random.normal(size=(4, 6)), random.normal(size=(4, 3))
     both = gram(two, gram(one))
     np.testing.assert_allclose(np.tril(both), np.tril(one @ one.T + two @ two.T))
+    turned = gram(np.asfortranarray(one))
+    np.testing.assert_allclose(np.tril(turned), np.tril(one @ one.T))
 
 
 def test_a_matrix_that_rounding_made_indefinite_is_mended() -> None:

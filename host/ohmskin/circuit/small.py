@@ -22,9 +22,11 @@ _BLOCK: Final = 64
 
 def gram(rows: Float, onto: Float | None = None) -> Float:
     """rows rows^T. It is added to the matrix `onto`, if there is one, which is overwritten."""
-    turned = rows.T  # C's order is Fortran's of the transpose: nothing is copied
+    # C's order is Fortran's of the transpose: nothing is copied.
+    turned = not rows.flags.f_contiguous
     beta = 0.0 if onto is None else 1.0
-    return np.asarray(blas.dsyrk(1.0, turned, beta, onto, trans=1, lower=1, overwrite_c=1))
+    given = rows.T if turned else rows
+    return np.asarray(blas.dsyrk(1.0, given, beta, onto, trans=turned, lower=1, overwrite_c=1))
 
 
 def cholesky(system: Float) -> Float:

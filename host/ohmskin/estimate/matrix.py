@@ -45,6 +45,7 @@ from scipy.linalg import lapack
 from ohmskin.arrays import Float
 from ohmskin.circuit.ports import port_difference
 from ohmskin.circuit.skin import impedance_of
+from ohmskin.circuit.small import gram
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinKnowledge
 from ohmskin.estimate.ohm import conductance_from_current, port_current
@@ -88,12 +89,13 @@ def solve_ports(cell_siemens: Float) -> tuple[Float, Float]:
     return np.maximum(port_ohm, 0.0), impedance
 
 
-def voltage_squared(impedance: Float, rows: int) -> Float:
-    """v^2 = -d rho_p / d g_e, shape (RC, RC) [ohm^2], for the port p = (i, j) and cell e = (k, l).
+def voltage_squared(impedance: Float, rows: int, scale: Float | float = 1.0) -> Float:
+    """v^2 s = -d rho_p / d g_e s, (RC, RC) [ohm^2 s], for the port p = (i, j) and cell e = (k, l).
 
-    v = (Z[i,k] - Z[i,l]) - (Z[j,k] - Z[j,l]), j and l the nodes of the columns.
+    v = (Z[i,k] - Z[i,l]) - (Z[j,k] - Z[j,l]), j and l the nodes of the columns; scale: s (RC,).
     """
-    voltage = port_difference(port_difference(impedance, rows).T, rows)
+    by_line = port_difference(impedance, rows).T * np.sqrt(scale)
+    voltage = port_difference(by_line, rows)
     voltage *= voltage
     return voltage
 
@@ -199,18 +201,17 @@ class CellFit:
         self._scale = np.maximum(trial.cell.ravel(), SCALE_FLOOR_SIEMENS)
 
     def _linearise(self) -> None:
-        """J^T J and J^T r at the present cells, if they have not been made there already."""
+        """J, the lower triangle of J^T J, and J^T r at the present cells, unless they are there."""
         if self._is_linearised:
             return
         self._is_linearised = True
         current, residual = self.best.current, self.best.residual
-        jacobian = voltage_squared(self.best.impedance, len(self.best.cell))
+        jacobian = voltage_squared(self.best.impedance, len(self.best.cell), self._scale)
         jacobian *= (current**2 / self._current_std)[:, None]
-        jacobian *= self._scale[None, :]
         self._gradient: Float = residual @ jacobian
         stretch = (1.0 - current * self._ref_ohm) / self._target_share
         self._far_gradient: Float = (residual * stretch) @ jacobian
-        self._normal: Float = jacobian.T @ jacobian
+        self._jacobian, self._normal = jacobian, gram(jacobian.T)
         self._diagonal = np.diagonal(self._normal).copy()
         # Rounding of J^T J is relative to its largest element: the ridge must not drown in it.
         self._ridge = max(_RIDGE, 1e-14 * float(self._diagonal.max()))
@@ -260,18 +261,21 @@ class CellFit:
         cell = self.best.cell.ravel()
         lowest = (MIN_CELL_SIEMENS - cell) / self._scale
         highest = (MAX_CELL_SIEMENS - cell) / self._scale
-        normal = self._normal.copy()
-        normal.ravel()[:: len(cell) + 1] += damping * self._diagonal + self._ridge
+        added = damping * self._diagonal + self._ridge
         held = ((lowest >= 0) & (gradient <= 0)) | ((highest <= 0) & (gradient >= 0))
         step = np.zeros_like(cell)
         for _ in range(rounds):
-            system, target, free = normal, gradient, ~held
+            target, free = gradient, ~held
             if not free.any():
                 break
             if held.any():  # the steps of the held cells are a part of the solution
-                system = normal[np.ix_(free, free)]
-                target = gradient[free] - normal[np.ix_(free, held)] @ step[held]
-            _, step[free], failed = lapack.dposv(system, target, lower=1)
+                system = self._normal[np.ix_(free, free)]
+                by_held = self._jacobian[:, held] @ step[held]
+                target = (gradient - by_held @ self._jacobian)[free]
+            else:
+                system = self._normal.copy(order="F")
+            np.einsum("ii->i", system)[:] += added[free]
+            _, step[free], failed = lapack.dposv(system, target, lower=1, overwrite_a=1)
             if failed:
                 return None
             crossing = ((step < lowest) | (step > highest)) & free
@@ -285,8 +289,8 @@ class CellFit:
     def cell_std(self) -> Float:
         """Root of the diagonal of (J^T J + ridge)^-1 [S], shape (R, C)."""
         self._linearise()
-        system = self._normal.copy()
-        system.ravel()[:: len(self._diagonal) + 1] += self._ridge
+        system = self._normal.copy(order="F")
+        np.einsum("ii->i", system)[:] += self._ridge
         factor, failed = lapack.dpotrf(system, lower=1, overwrite_a=1)
         if failed:
             return np.full(self.best.cell.shape, MAX_CELL_SIEMENS)  # nothing is known
