@@ -167,12 +167,13 @@ class PortCircuit:
 
     def _slopes(self, current: Float, sensed: Float, ohm: Float) -> Float:
         """r_e i_e j_e of all ports, (RC, resistances), from currents of lines (R+C, ...)."""
-        slopes = port_difference(current.reshape(len(current), -1), self.rows)
+        # Lines are fewer than ports: so r_e is multiplied by first.
+        root = np.sqrt(ohm.ravel())
+        slopes = port_difference(current.reshape(len(current), -1) * root, self.rows)
         if sensed is current:
             slopes *= slopes
         else:
-            slopes *= port_difference(sensed.reshape(len(sensed), -1), self.rows)
-        slopes *= ohm.ravel()
+            slopes *= port_difference(sensed.reshape(len(sensed), -1) * root, self.rows)
         return slopes
 
     def shorted_port_ohm(self, first: NDArray[np.intp], short_ohm: float) -> Float:
@@ -205,8 +206,20 @@ class PortCircuit:
         return self._slopes(self._wire_current, self._wire_sense_current, ohm)
 
     def by_layers(self) -> Float:
-        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm]."""
-        return np.asarray(self.by_wires().reshape(self.port_ohm.size, 2, -1).sum(axis=2))
+        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm].
+
+        With i = a - b of the row and the column of a port, and j = a' - b', the sum of r i j is
+        that of r a a', less those of r a b' and r b a', and that of r b b': sums of lines are
+        enough.
+        """
+        rows, lines, ohm = self.rows, sum(self.shape), [np.ravel(one) for one in self.wire_ohm]
+        current = self._wire_current.reshape(lines, 2, -1).transpose(1, 0, 2)
+        sensed = self._wire_sense_current.reshape(lines, 2, -1).transpose(1, 2, 0)
+        sums = np.stack([(current[layer] * ohm[layer]) @ sensed[layer] for layer in (0, 1)])
+        own = np.einsum("lii->li", sums)
+        slopes = own[:, :rows, None] + own[:, None, rows:] - sums[:, :rows, rows:]
+        slopes -= sums[:, rows:, :rows].transpose(0, 2, 1)
+        return np.asarray(slopes.reshape(2, -1).T)
 
     def by_leaks(self) -> Float:
         """Slopes by the leaks of rows, and of columns, (RC, 2) [ohm / S]."""

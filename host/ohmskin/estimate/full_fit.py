@@ -147,14 +147,16 @@ class FullFit:
     def _linearise(self) -> None:
         """Make J, N and S for the present state."""
         self._moved_log = 0.0
-        by_wires = self._circuit.by_wires()
+        wants_noise = self._moved_since_noise > OLD_NOISE_LOG
+        wants_segments = wants_noise or self._belief.learns_segments
+        by_wires = self._circuit.by_wires() if wants_segments else self._circuit.by_layers()
         by_leaks = 1e-6 * self._circuit.by_leaks() if self._belief.has_leaks else None  # by uS
         direct = self._belief.by_means(by_wires, self._means, by_leaks=by_leaks)
         self._by_cell = self._weighted(self._circuit.by_cell())
         # Cells at rest follow the means of the wires.
         by_rest = self._by_cell @ self._prior.by_means
         self._by_mean = self._weighted(direct) + by_rest
-        if self._moved_since_noise > OLD_NOISE_LOG:
+        if wants_noise:
             self._make_noise(by_wires)
         self._per_mean_std = self._belief.per_mean_std(self._by_mean)
         self._cell_std = np.sqrt(self._variance)

@@ -346,7 +346,8 @@ class WireBelief(ABC):
     ) -> Float:
         """How the resistance of k ports follows the means, at these means, (k, n).
 
-        by_segment: how it follows the logs of the segments, (k, 2RC).
+        by_segment: how it follows the logs of the segments, (k, 2RC). If m has no single segments,
+            it may as well be how it follows those of the layers, (k, 2).
         by_leaks: how it follows the leaks, (k, 2); None: m has no leaks.
         """
         slopes, leads = np.empty((len(by_segment), means.size)), self.leads_of_ports[ports]
