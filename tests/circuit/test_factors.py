@@ -4,7 +4,15 @@
 import numpy as np
 import pytest
 
-from ohmskin.circuit.small import cholesky, gram, inverse, solve, solve_lower, solve_positive
+from ohmskin.circuit.small import (
+    cholesky,
+    gram,
+    gram_factor,
+    inverse,
+    solve,
+    solve_lower,
+    solve_positive,
+)
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -46,6 +54,17 @@ def test_gram_adds_lower_triangles() -> None:
     np.testing.assert_allclose(np.tril(both), np.tril(one @ one.T + two @ two.T))
     turned = gram(np.asfortranarray(one))
     np.testing.assert_allclose(np.tril(turned), np.tril(one @ one.T))
+
+
+def test_the_factor_of_a_sum_keeps_what_was_added() -> None:
+    random = np.random.default_rng(4)
+    rows, onto = random.normal(size=(5, 3)), np.asfortranarray(np.diag(np.arange(1.0, 6.0)))
+    kept = onto.copy()
+    factor = np.tril(gram_factor(rows, onto))
+    np.testing.assert_allclose(factor @ factor.T, rows @ rows.T + kept)
+    np.testing.assert_array_equal(onto, kept)
+    rounded = gram_factor(np.array([[1e10], [2e10], [3e10]]), np.eye(3, order="F") * 1e-3)
+    assert np.isfinite(np.tril(rounded)).all()  # indefinite by rounding, and mended
 
 
 def test_a_matrix_that_rounding_made_indefinite_is_mended() -> None:

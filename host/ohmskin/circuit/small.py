@@ -49,6 +49,13 @@ def cholesky(system: Float) -> Float:
     return np.asarray(factor)
 
 
+def gram_factor(rows: Float, onto: Float) -> Float:
+    """L of L L^T = rows rows^T + onto, as of `cholesky`. `onto` is kept."""
+    system = gram(rows, onto.copy(order="F"))
+    factor, failed = lapack.dpotrf(system, lower=1, clean=0, overwrite_a=1)
+    return cholesky(gram(rows, onto.copy(order="F"))) if failed else np.asarray(factor)
+
+
 def solve(factor: Float, right: Float) -> Float:
     """x of L L^T x = right, for one or several columns."""
     solution, failed = lapack.dpotrs(factor, right, lower=1)

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.ports import PortCircuit
-from ohmskin.circuit.small import cholesky, gram, solve, solve_lower
+from ohmskin.circuit.small import cholesky, gram, gram_factor, solve, solve_lower
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
@@ -164,7 +164,7 @@ class FullFit:
         self._slopes = slopes = np.empty((cells, cells + self._mean_stds.size))  # J
         np.multiply(self._by_cell, self._cell_std, out=slopes[:, :cells])
         slopes[:, cells:] = self._per_mean_std
-        self._factor = cholesky(gram(slopes, onto=self._noise.copy(order="F")))  # L
+        self._factor = gram_factor(slopes, self._noise)  # L
 
     def _make_noise(self, by_wires: Float) -> None:
         """Make N, and W without s, for the present state.
@@ -173,9 +173,11 @@ class FullFit:
         """
         self._moved_since_noise = 0.0
         self._by_segment = self._weighted(by_wires)
-        self._noise = np.zeros((self._weight.size,) * 2, order="F")
         if own_std := self._belief.unlearned_std:
-            self._noise = own_std**2 * gram(self._by_segment)
+            self._noise = gram(self._by_segment)
+            self._noise *= own_std**2
+        else:
+            self._noise = np.zeros((self._weight.size,) * 2, order="F")
         np.einsum("ii->i", self._noise)[:] += 1.0
 
     def _minimise(self) -> None:
@@ -198,7 +200,9 @@ class FullFit:
                 return
             before = step
             self._evaluate()
-            step, is_last = self._step()
+            is_last = False
+            if self._moved_log < OLD_LOG:  # else `_is_last` would say no
+                step, is_last = self._step()
             if not is_last:
                 self._linearise()
                 step, is_last = self._step()
@@ -399,7 +403,7 @@ class FullFit:
         -J^T (N + J J^T)^-1 `slopes`.
         """
         by_cell = by_cell * self._cell_std
-        factor = cholesky(gram(by_cell, onto=self._noise.copy(order="F")))
+        factor = gram_factor(by_cell, self._noise)
         return -self._cell_std[:, None] * (by_cell.T @ solve(factor, slopes))
 
     def gains_of_shorts(self, first: NDArray[np.intp], short_ohm: float) -> Float:
@@ -443,7 +447,7 @@ class FullFit:
         cell_std = np.where(self._unnoticed | touched, UNLIMITED_STD, self._prior.std)
         odd_leads = self._weighted(self._belief.odd_lead_ohm() * self._belief.leads_of_ports)
         unlike = np.hstack([self._by_cell * cell_std, odd_leads])
-        factor = cholesky(gram(unlike, onto=self._noise.copy(order="F")))
+        factor = gram_factor(unlike, self._noise)
         return Lesson(self._per_mean_std, residual, factor)
 
 
