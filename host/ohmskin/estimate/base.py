@@ -5,6 +5,7 @@ A method derives from `Estimator` and writes `_solve`. Checking the readings, ti
 which cells are touched happen here, so that all methods do them alike.
 """
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -294,6 +295,8 @@ class Estimator(ABC):
         references = knowledge.ref_top_ohm, knowledge.ref_bottom_ohm
         model = ratio_from_current(current_siemens, *references)
         residual = (ports.ratio - model).ravel() / knowledge.ratio_std
-        if np.isnan(residual @ residual):
+        square = float(residual @ residual)
+        if math.isnan(square):
             residual = residual[~np.isnan(residual)]
-        return float(residual @ residual) / residual.size
+            square = float(residual @ residual)
+        return square / residual.size

@@ -6,6 +6,7 @@ Estimators, and the modules that prepare readings for them, are told a `SkinKnow
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -223,7 +224,7 @@ class SkinKnowledge:
         """The names of the readings that `check_ratio` returns: at near ends always a to d."""
         return NEAR if is_near(self.reading_names) else self.reading_names
 
-    @property
+    @cached_property
     def ratio_std(self) -> float:
         """Standard deviation of one reading, by its rounding alone [V/Vdd]."""
         return ratio_std(self.adc_bits)

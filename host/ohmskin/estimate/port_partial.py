@@ -86,6 +86,7 @@ class PartialEnds:
         nothing = np.zeros((knowledge.rows, knowledge.columns))
         ports = PortCurrents(nothing, nothing + 1.0 / knowledge.ref_ohm)
         self._rest = Shown(ports, np.zeros(READINGS_PER_CELL), 0.0)
+        self._no_age = nothing
         self.reset()
 
     def reset(self) -> None:
@@ -100,7 +101,7 @@ class PartialEnds:
         noises = [each for each in (shown.noise, self._rest.noise) if each]
         self._last = shown._replace(noise=min(noises, default=0.0))
         self.region = None
-        self._age = np.zeros_like(self._age)
+        self._age = self._no_age  # never written into
 
     def keep_as_rest(self) -> None:
         """What the last frame has shown is of the untouched skin."""
