@@ -2,6 +2,7 @@
 """``calibrate recording --total``: curves of all cells from the force on the whole skin."""
 
 import json
+import tracemalloc
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -75,6 +76,23 @@ def test_an_average_is_the_mean_of_its_window() -> None:
     for got, end_s in zip(shown[:, 0], (1.4, 2.0), strict=True):
         window = np.linspace(end_s - 0.4, end_s, 1001)
         assert got == pytest.approx(np.mean(np.interp(window, time_s, force_n)), abs=2e-3)
+
+
+@pytest.mark.parametrize("scale", [Scale(0.0), Scale(0.2, 0.1), Scale(0.05, 0.3, averages=True)])
+def test_a_scale_of_many_columns_takes_little_memory(scale: Scale) -> None:
+    """Those of 16x16 cells took half a gigabyte: the grid of the filter has more times."""
+    time_s, _, force_n = presses(1, 100, 500)
+    at_s = time_s[::2]
+    scale.shown(time_s, force_n[:, :1], at_s)  # loads what it needs
+    tracemalloc.start()
+    try:
+        shown = scale.shown(time_s, force_n, at_s)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 4 * shown.nbytes
+    for n in (0, 250, 499):
+        assert np.array_equal(shown[:, [n]], scale.shown(time_s, force_n[:, [n]], at_s))
 
 
 @pytest.mark.parametrize("scale", [Scale(0.2, 0.1), Scale(0.05, 0.3, averages=True)])

@@ -39,6 +39,9 @@ LEAST_STEP_S: Final = 0.01
 # The grid has at most so many points for each scan, however long a pause or a jump of the clock
 # makes it. Chosen: twenty times as many as scans without a pause have.
 MOST_POINTS: Final = 40
+# So many columns of forces are filtered at once. Chosen: a fit of 16x16 cells has 500 columns, and
+# all of them on the grid took half a gigabyte.
+COLUMNS: Final = 32
 
 
 # A scale that prints nothing for so long has made a pause [s].
@@ -124,6 +127,12 @@ class Scale:
 
     def shown(self, time_s: Float, force_n: Float, at_s: Float) -> Float:
         """y at some times (m,), of forces (n, k) at increasing times (n,): (m, k)."""
+        firsts = range(0, force_n.shape[1], COLUMNS)
+        parts = (force_n[:, first : first + COLUMNS] for first in firsts)
+        return np.hstack([self._shown(time_s, part, at_s) for part in parts])
+
+    def _shown(self, time_s: Float, force_n: Float, at_s: Float) -> Float:
+        """`shown` of all columns at once."""
         from scipy.signal import lfilter
 
         longest_s = float(time_s[-1] - time_s[0]) / (MOST_POINTS * time_s.size)
