@@ -26,7 +26,6 @@ large     16x16, 20,000 scans: seconds of the whole command, and its memory.
 from __future__ import annotations
 
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -40,7 +39,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bars import ALL, Bar, Part, at_least, at_most, finish, options  # beside this file
-from kneaded_skin import KneadedSkin, Scale  # tests/helpers
+from command_line import PRINTS_PEAK  # tests/helpers
+from kneaded_skin import KneadedSkin, Scale
 from pressed_skin import Forces, Plan, calibrate
 from studies.rows import in_processes
 
@@ -85,14 +85,14 @@ class Shown(NamedTuple):
 
 def knead(recording: Path, out: Path) -> dict[str, Any]:
     """Run the command in a process of its own: what it says, its seconds and its memory."""
-    arguments = ["-m", "ohmskin", "calibrate", "recording", str(recording), str(out)]
+    arguments = ["calibrate", "recording", str(recording), str(out), "--total", "--json"]
     begin_s = time.monotonic()
     done = subprocess.run(
-        [sys.executable, *arguments, "--total", "--json"], check=True, capture_output=True
+        [sys.executable, "-c", PRINTS_PEAK, *arguments], check=True, capture_output=True
     )
-    said: dict[str, Any] = json.loads(done.stdout)
-    memory_gb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
-    return said | {"seconds": time.monotonic() - begin_s, "gigabytes": memory_gb}
+    answer, peak_kb = done.stdout.splitlines()
+    said: dict[str, Any] = json.loads(answer)
+    return said | {"seconds": time.monotonic() - begin_s, "gigabytes": int(peak_kb) / 1e6}
 
 
 def show(task: Task) -> Shown:

@@ -9,14 +9,18 @@ import json
 import runpy
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import bench_knead
 from bars import at_least, at_most, report
 from bench_firmware import capacitor_error_lsb
 from bench_honest import Pooled
+from kneaded_skin import KneadedSkin
 from places import ROOT
+from pressed_skin import Plan
 
 BENCHMARKS = sorted(path.stem for path in (ROOT / "benchmarks").glob("bench_*.py"))
 SHORT = (
@@ -94,3 +98,13 @@ def test_an_error_of_less_than_a_code_is_measured(node_pf: int) -> None:
     shared_lsb = 1024 * 14 / joined_pf * np.exp(-353 / 16e6 / (30e3 * 1e-12 * joined_pf))
     found_lsb = capacitor_error_lsb("uno", 0, sample_pf=14, node_pf=node_pf)
     assert found_lsb == pytest.approx(shared_lsb, abs=0.05)
+
+
+def test_the_memory_of_kneading_is_that_of_the_command(tmp_path: Path) -> None:
+    """It was that of the benchmark itself, which has all forces of a skin of 16x16."""
+    skin = KneadedSkin(Plan((100.0, 200.0), "series", 1, shape=(2, 2), touches=1), 500)
+    skin.record_kneading(tmp_path / "skin.mcap")
+    held = np.ones(100_000_000)  # 0.8 GB of this process
+    said = bench_knead.knead(tmp_path / "skin.mcap", tmp_path / "skin.json")
+    assert said["presses"] > 0
+    assert said["gigabytes"] < 1e-9 * held.nbytes / 2

@@ -44,15 +44,19 @@ def python(*arguments: str | Path, **variables: str) -> Done:
     return Done(done.returncode, done.stdout, done.stderr)
 
 
-# Not `ru_maxrss`: that of a new process begins with what the one that starts it has.
-_BOUNDED = """
-import atexit, pathlib, re, resource, sys
-resource.setrlimit(resource.RLIMIT_AS, (4_000_000_000, 4_000_000_000))
+# A command line that prints, last of all, the most memory that it had [kB]. Not `ru_maxrss`: that
+# of a new process begins with what the one that starts it has.
+PRINTS_PEAK = """
+import atexit, pathlib, re
 status = pathlib.Path("/proc/self/status")
 atexit.register(lambda: print(re.search(r"VmHWM:\\s+(\\d+)", status.read_text())[1]))
 from ohmskin.cli.main import main
 main()
 """
+_BOUNDED = f"""
+import resource
+resource.setrlimit(resource.RLIMIT_AS, (4_000_000_000, 4_000_000_000))
+{PRINTS_PEAK}"""
 # What a run takes that reads next to nothing [MB]: 75 measured, and some for other versions.
 EMPTY_MB = 90.0
 
