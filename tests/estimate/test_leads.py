@@ -13,7 +13,7 @@ from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.methods import make_estimator
-from studies.trials import Trial, finger_trial, random_trial, trial_of
+from studies.trials import Trial, finger_trial, random_trial, skin_at_rest, trial_of
 
 METHODS = ("joint", "touch")
 
@@ -122,3 +122,32 @@ def test_fingertips_alone_show_the_lead_at_far_ends() -> None:
     behind = with_leads(finger_trial(8, 8, 6, seed=3), 600.0)
     _, lead_ohm = estimates(behind, "joint", None, "far")
     assert lead_ohm == pytest.approx(behind.rest.lead_ohm.mean(), rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_lead_that_is_told_takes_no_place_of_weak_cells_under_a_fingertip(seed: int) -> None:
+    """Two hard fingertips of 60 came out up to five times as hard, behind a lead that is not there.
+
+    The lead was told with a deviation, 150 ohm, as a calibration has it. Each frame is read alone.
+    """
+    random = np.random.default_rng(seed)
+    rest = skin_at_rest(8, 8, random, wire_ohm=(100.0, 200.0))
+    rows, columns = np.indices(rest.shape)
+    frames = []
+    for _ in range(60):
+        row, column = random.uniform(0, 7, 2)
+        width, force_n = random.uniform(0.7, 1.2), random.uniform(8, 12)
+        pressure = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / width**2)
+        pressure[pressure < 0.01 * pressure.max()] = 0.0
+        contact = 30e-6 * (force_n * pressure / pressure.sum()) ** 1.5
+        contact *= np.exp(0.2 * random.standard_normal(rest.shape))
+        rise = contact / (1 + 250 * contact)
+        frames.append(replace(rest, cell_siemens=rest.cell_siemens + rise))
+    trial = trial_of(rest, frames, (100.0, 200.0))
+    given = trial.rounded(10)
+    wires = given.knowledge(0).nominal_wire_ohm._replace(lead=0.0, lead_std_ohm=150.0)
+    estimator = make_estimator("joint", replace(given.knowledge(0), nominal_wire_ohm=wires))
+    for ratio, true in zip(given.ratio, trial.cell_siemens, strict=True):
+        estimator.reset()
+        answer = estimator.estimate(ratio)
+        assert answer.cell_siemens.max() == pytest.approx(true.max(), rel=0.2)
