@@ -195,7 +195,8 @@ class Kneading:
             prior = WireSlopes(self._slopes(wires, levels), centre - w, std)
             fit = TotalFit(self._totals(levels, log), prior, scale).fit()
             scale = fit.scale_
-            step, stds = fit.w
+            step, covariance = fit.w
+            stds = np.sqrt(covariance.diagonal())
             w = w + step.clip(-LONGEST_STEP, LONGEST_STEP)
             if is_first and (np.abs(step) < np.maximum(SHORT_STEP, stds)).all():
                 used, is_first = self._in_stretches(TRIAL_CELLS), False

@@ -44,7 +44,9 @@ All rows of one press have nearly the same error. So they count as `PRESS_ROWS` 
 press is kept or left out as a whole. In the first rounds, only the presses that fit best count, and
 the gains of cells may hardly differ. After these, all presses count but those that are off by more
 than `OUTLIER_STDS` robust deviations. The force of such a press does not go through the skin: a
-finger is beside it, or a hand on the plate.
+finger is beside it, or a hand on the plate. Of presses that stay, the farther one is off, the less
+it counts, as if errors were those of Student's t. A hard press whose cells are estimated wrong
+would else be explained by other wires: one of 240 that was off by 18 % made them 40 % too large.
 
 Three things bend the curve in the same way as wires do: a resistance that no force lowers (c);
 hysteresis (h), because the largest force of each press comes while the force grows; and force on
@@ -131,6 +133,9 @@ OUTLIER_STDS: Final = 4.0
 # In the first rounds only this share of the presses counts: those that fit best. Chosen: fewer
 # presses are beside the skin.
 SURE_SHARE: Final = 0.7
+# Errors of presses scatter as Student's t of so many degrees of freedom. Chosen: the usual number
+# for errors that are normal but for a few.
+FREEDOM: Final = 4.0
 # A press is never left out that is off by less than this share, or by less than this force [N].
 LEAST_OFF: Final = 0.15
 LEAST_OFF_N: Final = 0.15
@@ -212,6 +217,7 @@ class TotalFit:
         self._group()
         _check_enough(int(np.count_nonzero(self._is_press)))
         self._out: Bool = np.zeros(self._groups, dtype=bool)
+        self._trust: Float = np.ones(self._groups)
 
     def _set_zero(self) -> None:
         """B, and the precision of z."""
@@ -372,7 +378,7 @@ class TotalFit:
         rows = np.bincount(self._of_row, minlength=self._groups)[self._of_row]
         press_rows = PRESS_ROWS if self._wires is None else WIRE_PRESS_ROWS
         share = np.where(self._pressed, np.minimum(1.0, press_rows / rows), 1.0)
-        return np.asarray(kept * share / variance)
+        return np.asarray(kept * share * self._trust[self._of_row] / variance)
 
     def _prior(self) -> tuple[Float, Float]:
         """Precision of p, and its pull."""
@@ -388,7 +394,7 @@ class TotalFit:
         return precision, precision @ (centre - p)
 
     def _judge(self, *, trims: bool) -> None:
-        """Decide which presses and pauses are left out of the next round, by how far each is off.
+        """Decide what counts in the next round, and how much, by how far each press is off.
 
         trims: leave out outliers alone, and let the gains of cells scatter as far as they do; else
             keep only the presses that fit best.
@@ -409,6 +415,8 @@ class TotalFit:
             most = np.quantile(stds[presses], SURE_SHARE)
             self._out = stds > np.where(self._is_press, most, OUTLIER_STDS)
             return
+        trust = (FREEDOM + 1) / (FREEDOM + stds**2)
+        self._trust = np.where(self._is_press, trust, 1.0)
         least_n = np.maximum(LEAST_OFF_N, LEAST_OFF * force_n)
         self._out = (stds > OUTLIER_STDS) & (off > least_n)
         self.largest_n = float(self._parts(self._contact()[0]).max())
@@ -421,9 +429,9 @@ class TotalFit:
 
     @property
     def w(self) -> tuple[Float, Float]:
-        """w and its standard deviations, (2,)."""
+        """w, (2,), and its covariance, (2, 2)."""
         of_wires = self._of_wires
-        return self._p[of_wires], np.sqrt(self.covariance_.diagonal()[of_wires])
+        return self._p[of_wires], np.asarray(self.covariance_[of_wires, of_wires])
 
     @property
     def presses(self) -> int:
