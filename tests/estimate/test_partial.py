@@ -300,3 +300,58 @@ def test_cells_outside_a_region_keep_all_of_their_uncertainty() -> None:
     whole = estimator.estimate(frame)
     part = estimator.estimate(of_region(frame, slice(0, 3), slice(0, 3), READ["near"]))
     assert part.cell_siemens_std[6, 6] >= whole.cell_siemens_std[6, 6]
+
+
+def charged(ratio: Float, random: np.random.Generator) -> Float:
+    """Readings (F, R, C, 4) with lines that charge: a little at each cell, by 2 LSB on average.
+
+    Row and column draw what the other cells of these lines conduct to them. A and C are read while
+    it is all there, B and D when a tenth of it is left.
+    """
+    current = 1.0 - ratio[..., 0]  # times the reference
+    by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (2, 1))
+    drawn = random.normal(2.0, 2.0, current.shape) / 1024
+    row, column = drawn * by_row / (by_row + by_column), drawn * by_column / (by_row + by_column)
+    return ratio + np.stack([-row, -0.1 * column, column, 0.1 * row], axis=-1)
+
+
+@pytest.mark.parametrize("lines_charge", [False, True])
+def test_whole_scans_show_offsets_however_lines_charge(lines_charge: bool) -> None:
+    made, rest, _ = trial("touches")
+    random, offset = np.random.default_rng(4), np.array([2.0, -1.0, -1.0, 2.0]) / 1024
+    exact = np.repeat(made.readings.ratio[6:7], 40, axis=0)
+    ratio = (charged(exact, random) if lines_charge else exact) + offset
+    ratio = ratio_from_codes(quantise(ratio + NOISE_RATIO * random.standard_normal(ratio.shape)))
+    reader, every = PortReader(knowledge(rest)), slice(None)
+    errors = []
+    for whole in ratio:
+        reader.read(whole, in_order=True)
+        quick = ratio_from_codes(
+            quantise(exact[0] + offset + NOISE_RATIO * random.standard_normal(exact[0].shape))
+        )
+        found = reader.read(of_region(quick, every, every, READ["quick"]), in_order=True)
+        errors.append(found.current * made.rest.ref_bottom_ohm - exact[0, ..., 1])
+    assert abs(np.mean(errors)) * 1024 < 0.15
+
+
+def test_whole_scans_show_a_bow_of_the_converter_and_noise() -> None:
+    """Four readings of a cell cancel the bow, and one does not. Rest, a mean, shows no noise."""
+    made, _, _ = trial("finger")
+    random, bow, noise = np.random.default_rng(4), 2.0 / 1024, 0.8 / 1024
+
+    def read(exact: Float) -> Float:
+        bent = exact + bow * 4 * exact * (1 - exact)
+        return ratio_from_codes(quantise(bent + noise * random.standard_normal(exact.shape)))
+
+    at_rest = made.readings.rest_ratio
+    assert at_rest is not None
+    rest = read(np.repeat(at_rest[None], 50, axis=0)).mean(axis=0)
+    reader, every, errors = PortReader(knowledge(rest)), slice(None), []
+    for exact in np.repeat(made.readings.ratio, 3, axis=0):
+        reader.read(read(exact), in_order=True)
+        found = reader.read(of_region(read(exact), every, every, READ["quick"]), in_order=True)
+        current = exact[..., 1] / made.rest.ref_bottom_ohm
+        errors.append((found.current - current) / found.current_std)
+    hard = made.readings.ratio.repeat(3, axis=0)[20:, ..., 1] > 0.25
+    assert abs(np.mean(np.array(errors)[20:][hard])) < 0.3
+    assert 0.85 < np.std(errors[20:]) < 1.15

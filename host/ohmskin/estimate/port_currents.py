@@ -108,6 +108,14 @@ class NearReadings(NamedTuple):
     offset_ratio: Float
 
 
+def row_share(current: Float) -> Float:
+    """(I_row - I_column) / (I_row + I_column) of currents (R, C)."""
+    by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
+    # Noise may make currents negative, and so the share larger than it can be.
+    share = (by_row - by_column) / np.maximum(by_row + by_column, 1e-12)
+    return np.asarray(np.clip(share, -1.0, 1.0))
+
+
 class NearEnds:
     """Reads the currents at the near ends of the lines. per_cell: n, readings of a cell there."""
 
@@ -142,12 +150,8 @@ class NearEnds:
 
     def charging(self, near: NearReadings) -> Float:
         """What lines that charge add to the currents of least squares, (R, C) [S]."""
-        current = near.current
-        by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
-        # Noise may make currents negative, and so the share larger than it can be.
-        share = (by_row - by_column) / np.maximum(by_row + by_column, 1e-12)
         charging = near.residual @ self._into_row  # c
-        return np.asarray(charging * np.clip(share, -1.0, 1.0))
+        return np.asarray(charging * row_share(near.current))
 
     def best_three(self, ratio: Float) -> tuple[float, float]:
         """Leave out one of the four readings (4,) of a cell in mode near: the one that fits least.

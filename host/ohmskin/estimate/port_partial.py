@@ -6,10 +6,12 @@ Symbols are those of `port_currents` and `port_noise`; K are the readings of a c
     I = sum_{k in K} s_k R_k (y_k - o_k - b_k) / sum_{k in K} R_k^2 ,
     s_I^2 = v_I / sum R_k^2 .
 
-Fewer than four readings do not show the offset o_k of each node, nor v. Both are taken from the
-last frame in which all was read; before there was one, from the rest readings. v is that of the
-rest readings if they have less, because lines that charge add to v in a frame. Where neither a
-frame nor rest was read, o_k is 0, and of two or more readings,
+Fewer than four readings do not show the offset o_k of each node, nor v, nor the bow beta of the
+converter, which four readings cancel. Frames in which all was read show them (`port_mirror`): o_k
+is that of the last one, v and beta are those of all of them. beta 4 y_k (1 - y_k) counts to b_k.
+Before there was such a frame, the rest readings stand in for it. They may be a mean of many scans,
+which shows hardly any noise, and then v is too small. Where neither was read, o_k is 0, and of two
+or more readings,
 
     v = median over cells of (I_1 - I_2)^2 / (R_1^-2 + R_2^-2) / 0.455 ,
 
@@ -45,7 +47,8 @@ from ohmskin.circuit.configurations import (
     reference_ohm,
 )
 from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.estimate.port_currents import PortCurrents
+from ohmskin.estimate.port_currents import NearReadings, PortCurrents
+from ohmskin.estimate.port_mirror import BoardShown, MirrorReadings, bow_shape
 from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE
 
 # Share of its current by which a port that is not read may change from frame to frame. Chosen: by
@@ -62,16 +65,18 @@ CLEAR_NOISES: Final = 4.0
 
 
 class Shown(NamedTuple):
-    """What the last frame of all readings has shown. Before there is one, offset and noise are 0.
+    """What the last frame of all readings has shown. Before there is one, noise is 0.
 
     ports: its currents, or newer ones of ports that were read since.
-    offset_ratio: o_k of each reading (4,) [V/Vdd].
-    noise: v [V^2/Vdd^2]; 0: not known.
+    noise: v, as `port_noise` has it [V^2/Vdd^2]; 0: not known.
+    near: its readings, as long as nobody has asked what they show of the board.
+    is_live: whether it is no frame at rest.
     """
 
     ports: PortCurrents
-    offset_ratio: Float
     noise: float
+    near: NearReadings | None = None
+    is_live: bool = False
 
 
 class PartialEnds:
@@ -85,13 +90,15 @@ class PartialEnds:
         self._rounding = knowledge.ratio_std**2
         nothing = np.zeros((knowledge.rows, knowledge.columns))
         ports = PortCurrents(nothing, nothing + 1.0 / knowledge.ref_ohm)
-        self._rest = Shown(ports, np.zeros(READINGS_PER_CELL), 0.0)
+        self._rest, self._mirrors = Shown(ports, 0.0), MirrorReadings(knowledge)
         self._no_age = nothing
         self.reset()
 
     def reset(self) -> None:
         """Forget the frames before, but for rest."""
         self._last = self._rest
+        self._board = BoardShown(np.zeros(READINGS_PER_CELL))
+        self._mirrors.reset()
         self.region: NDArray[np.intp] | None = None
         self._age: Float = np.full(self._rest.ports.current.shape, _NEVER_FRAMES)
 
@@ -108,15 +115,28 @@ class PartialEnds:
         self._rest = self._last
         self.reset()
 
+    def _of_board(self) -> BoardShown:
+        """What all whole frames have shown of the board.
+
+        Only the last of several whole frames is asked, and only now: modes that read all need none
+        of this.
+        """
+        if self._last.near is not None:
+            self._board = self._mirrors.take(self._last.near, is_live=self._last.is_live)
+            self._last = self._last._replace(near=None)
+        return self._board
+
     def read(self, ratio: Float) -> PortCurrents:
         """Currents of all ports, by readings (R, C, 4) of which some are NaN."""
+        board = self._of_board()
         kinds = ~np.isnan(ratio).all(axis=(0, 1))
         slope = (READING_SIGN * self._reference)[kinds]
-        signal = (ratio - READING_OFFSET - self._last.offset_ratio)[..., kinds]
+        signal = (ratio - READING_OFFSET - board.offset_ratio)[..., kinds]
+        signal = signal - board.bow_ratio * bow_shape(ratio[..., kinds])
         by_each = signal / slope
-        # The rest readings may be a mean of many scans, which shows hardly any noise: a scan has at
-        # least that of rounding.
-        noise = max(self._last.noise or self._noise(by_each, slope), 2.0 * self._rounding)
+        # A scan has at least the noise of rounding.
+        shown = board.noise or self._last.noise or self._noise(by_each, slope)
+        noise = max(shown, 2.0 * self._rounding)
         square_ohm = float(slope @ slope)
         current = signal @ slope / square_ohm
         error = noise

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a frame's readings to what estimators take: a current for each port, and what is wrong.
 
-`PortReader` brings four subjects together, of which each is a module:
+`PortReader` brings five subjects together, of which each is a module:
 
 - `port_currents`: the current through each port, without offsets of the board and without what
   floating lines draw; at far ends also what the wires lose.
 - `port_partial`: the same where not all was read.
+- `port_mirror`: what whole frames show of the board, for frames of which not all is read.
 - `port_noise`: the standard deviation of each current, by how far readings disagree and change.
 - `port_faults`: what no touches can make of a skin.
 """
@@ -160,6 +161,6 @@ class PortReader:
         ratio_std = self._knowledge.ratio_std
         ports, fault = mended(self._near_ends, near, spread, ports, ratio_std)
         if not any(self.far):
-            self._partial.keep(Shown(ports, near.offset_ratio, variances.noise))
+            self._partial.keep(Shown(ports, variances.noise, near, in_order))
         # In mode far, both near ends have the same offset. Mode near does not use it.
         return NearPorts(ports, fault, spread, variances, float(near.offset_ratio[0]))
