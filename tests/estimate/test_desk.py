@@ -95,6 +95,8 @@ def test_fewer_readings_at_default_rates(mode: str) -> None:
             *_, ports = (reader.read(each, in_order=True) for each in scans)
             errors_lsb.append(1024 * (trial.rest.ref_bottom_ohm * ports.current - exact[..., 1]))
     assert np.sqrt(np.mean(np.square(errors_lsb))) < {"half": 1.0, "quick": 1.2}[mode]
+    # Noise alone makes 0.5 and 0.58 LSB, as A hardly counts where lines charge.
+    assert np.std(errors_lsb) < {"half": 0.71, "quick": 0.9}[mode]
     judged = pooled(parts)
     assert judged.error_percent() < 2
     assert judged.pressed_within_percent() > 95

@@ -22,13 +22,20 @@ decides where lines charge. A single reading has v_I = v. Several show it as in 
     v_cell = sum_k residual_k^2 / (|K| - 1) ,  v_I = v + STAYING_SHARE^2 max(0, v_cell - v) .
 
 If A and B alone are read, lines that charge add to A, and take less from B, which is read a slot
-later. Of what stays in the difference of both currents, I_A - I_B, the share `FIRST_SHARE` is what
-A has too much, and the remainder is what B lacks. I has R_A^2 / sum R_k^2 of the first in it, and
-lacks 1 - R_A^2 / sum R_k^2 of the second, so that
+later. Of what they make in the difference of both currents, I_A - I_B, A has too much by the share
 
-    I -= (FIRST_SHARE - 1 + R_A^2 / sum R_k^2) max(0, 1 - CLEAR_NOISES v / v_cell) (I_A - I_B) .
+    f = FIRST_SHARE + ROW_SHARE (I_row - I_column) / (I_row + I_column) ,
 
-The factor max(...) is there because a difference that is hardly above noise may be noise.
+and B lacks the remainder. (`port_currents` says why I_row and I_column decide what is drawn from
+the row, of which A is a reading.) I has R_A^2 / sum R_k^2 of the first in it, and lacks
+1 - R_A^2 / sum R_k^2 of the second, so that
+
+    I -= (f - 1 + R_A^2 / sum R_k^2) max(0, 1 - n v / v_cell) (I_A - I_B) ,
+    n = max(1, CLEAR_NOISES v / mean of v_cell) .
+
+The factor max(...) is the share of v_cell that is not noise. Where hardly a cell of the frame
+differs by more than noise, no lines charge, and n keeps the correction from following noise. With k
+for what I_A - I_B is multiplied by, its noise adds v k^2 (R_A^-2 + R_B^-2) sum R_k^2 to v_I.
 
 A port that was not read keeps its last current. Its deviation grows by `STALE_SHARE` of the current
 with each frame since then.
@@ -47,7 +54,7 @@ from ohmskin.circuit.configurations import (
     reference_ohm,
 )
 from ohmskin.estimate.knowledge import SkinKnowledge
-from ohmskin.estimate.port_currents import NearReadings, PortCurrents
+from ohmskin.estimate.port_currents import NearReadings, PortCurrents, row_share
 from ohmskin.estimate.port_mirror import BoardShown, MirrorReadings, bow_shape
 from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE
 
@@ -57,10 +64,12 @@ STALE_SHARE: Final = 0.03
 # Ports that no frame has shown yet are taken for as old as so many frames. Chosen: as above.
 _NEVER_FRAMES: Final = 30
 # Share of A in the difference that lines that charge make between A and B, in modes with these two
-# alone. Measured in firmware/sim with its preset `desk`: 0.75 to 0.85, by the length of slots.
-FIRST_SHARE: Final = 0.8
-# A disagreement v_cell below so many times v counts as noise. Chosen: two deviations; with less,
-# the correction would follow noise, and two readings would tell hardly more than one.
+# alone, and how much larger it is where the row draws all. Measured in firmware/sim with its preset
+# `desk`, touches and fingertips, at the default settle time.
+FIRST_SHARE: Final = 0.84
+ROW_SHARE: Final = 0.25
+# n in a frame whose cells differ by noise alone. Chosen: two deviations; with less, the correction
+# would follow noise, and two readings would tell hardly more than one.
 CLEAR_NOISES: Final = 4.0
 
 
@@ -146,9 +155,16 @@ class PartialEnds:
             staying = np.maximum(by_cell - noise, 0.0)
             error = noise + STAYING_SHARE**2 * staying
             if kinds.tolist() == [True, True, False, False]:
+                # NaN are cells that were not read.
+                noises = max(1.0, CLEAR_NOISES * noise / max(float(np.nanmean(by_cell)), 1e-30))
+                charged = np.maximum(1.0 - noises * noise / np.maximum(by_cell, 1e-30), 0.0)
+                first = FIRST_SHARE + ROW_SHARE * row_share(
+                    np.where(np.isnan(current), self._last.ports.current, current)
+                )
                 weight = slope[0] ** 2 / square_ohm
-                share = np.maximum(1.0 - CLEAR_NOISES * noise / np.maximum(by_cell, 1e-30), 0.0)
-                current -= (FIRST_SHARE - 1 + weight) * share * (by_each[..., 0] - by_each[..., 1])
+                taken = (first - 1 + weight) * charged
+                current -= taken * (by_each[..., 0] - by_each[..., 1])
+                error += noise * taken**2 * square_ohm * float(np.sum(slope**-2.0))
         std = np.broadcast_to(np.sqrt(error / square_ohm), current.shape)
         is_read, last = ~np.isnan(current), self._last.ports
         ports = PortCurrents(
