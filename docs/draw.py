@@ -32,7 +32,7 @@ from ohmskin.link.codes import ADC_BITS, ratio_std  # noqa: E402
 
 CLOCK_HZ = 16_000_000
 # Hold to the change of pins, at most, and to the end of the conversion, at an ADC clock of 500 kHz.
-PINS_CYCLES = 120
+PINS_CYCLES = 104
 HELD_CYCLES = 23 * 32 // 2
 CELLS_OHM = (1e3, 1e4, 1e5, 1e6)
 REFERENCES_OHM = (3e3, 1e4, 3e4, 1e5)
@@ -72,7 +72,7 @@ def slot() -> dict[str, float]:
     return {
         "trigger": trigger,
         "hold": hold,
-        "interrupt": hold + prescaler + spare - entry,
+        "interrupt": hold + prescaler // 2 + spare - entry,
         "pins_set": hold + PINS_CYCLES,
         "conversion_done": trigger + 13 * prescaler + prescaler // 2 + 3,
         "cycles": cycles,

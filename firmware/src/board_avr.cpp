@@ -153,18 +153,19 @@ constexpr Registers REGISTERS[] = {
 //     interrupt_at()                compare A: the interrupt begins
 //     hold = TRIGGER_AT + HOLD_SYNC_CYCLES + HOLD_ADC_CLOCKS
 //                                   the sample is held
-//     hold + OPEN_ADC_CLOCKS        the sample is held by now, whatever the data sheet leaves open
+//     hold + open_cycles()          the sample is held by now, whatever the data sheet leaves open
 //     ... + PINS_SPARE              the first pin changes, PINS_AFTER_INTERRUPT after compare A
 
 // Any cycle but the slot's first ones would serve. start_slots() writes the counter, and the data
 // sheets ("16-bit Timer/Counter1", "Using the Output Compare Unit") say that no match is
 // seen in the cycle after that.
 constexpr uint16_t TRIGGER_AT = 8;
-// Clock cycles and ADC clocks from the trigger to the hold, and ADC clocks that are left open
-// because the data sheets give the hold in whole ones ("Prescaling and Conversion Timing", auto
-// triggered).
-constexpr uint16_t HOLD_SYNC_CYCLES = 3;
-constexpr uint16_t HOLD_ADC_CLOCKS = 2, OPEN_ADC_CLOCKS = 1;
+// Clock cycles and ADC clocks from the trigger to the hold ("Prescaling and Conversion Timing",
+// auto triggered).
+constexpr uint16_t HOLD_SYNC_CYCLES = 3, HOLD_ADC_CLOCKS = 2;
+// What that leaves open: half an ADC clock. The data sheets give holds and ends of conversions in
+// halves, 11.5 ADC clocks from one to the other in each kind of conversion.
+constexpr uint16_t open_cycles(uint8_t prescaler) { return prescaler / 2; }
 // Clock cycles from compare A to the first change of a pin, at the least: the chip enters the
 // interrupt, the compiler's code saves registers, and select() looks the pins up. This number is
 // the compiler's: with avr-gcc 5.4 it is 56 on the Uno and 55 on the Mega, with 7.3 it is 55 on
@@ -174,9 +175,8 @@ constexpr uint16_t PINS_AFTER_INTERRUPT = 55;
 // Clock cycles to spare, for a compiler whose code is a little faster. Chosen.
 constexpr uint16_t PINS_SPARE = 3;
 constexpr uint16_t interrupt_at(uint8_t prescaler) {
-    return static_cast<uint16_t>(TRIGGER_AT + HOLD_SYNC_CYCLES +
-                                 (HOLD_ADC_CLOCKS + OPEN_ADC_CLOCKS) * prescaler + PINS_SPARE -
-                                 PINS_AFTER_INTERRUPT);
+    return static_cast<uint16_t>(TRIGGER_AT + HOLD_SYNC_CYCLES + HOLD_ADC_CLOCKS * prescaler +
+                                 open_cycles(prescaler) + PINS_SPARE - PINS_AFTER_INTERRUPT);
 }
 
 // The prescaler as the converter's register has it: its logarithm to the base 2.

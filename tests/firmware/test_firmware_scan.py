@@ -221,13 +221,16 @@ def test_settle_time_before_each_hold(rig: Rig, mode: str) -> None:
 
 @pytest.mark.parametrize(("accuracy", "adc_clock"), [("usual", 32), ("fine", 64), ("finest", 128)])
 def test_pins_change_after_the_hold_and_not_before(rig: Rig, accuracy: str, adc_clock: int) -> None:
-    """The data sheet leaves some of an ADC clock open, and the compiler decides how soon it is."""
+    """The data sheet leaves half an ADC clock open, and the compiler decides how soon it is.
+
+    What is later by more is taken from the time to settle.
+    """
     rig.start_scan(rate_mhz=0, accuracy=accuracy)
     rig.sim.reset_stats()
     rig.run(0.1)
-    spare = rig.sim.stats()["change_after_hold_cycles_min"] - adc_clock
+    spare = rig.sim.stats()["change_after_hold_cycles_min"] - adc_clock // 2
     print(f"{rig.board}, {accuracy}: {spare} cycles to spare (PINS_SPARE in board_avr.cpp)")
-    assert spare >= 0
+    assert 0 <= spare <= 12
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 1), (2, 1), (3, 1), (4, 3)])

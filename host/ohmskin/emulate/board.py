@@ -71,7 +71,7 @@ IDLE_TO_CHANGE, FEW, IDLE_OF_FEW = 3, 3, 5
 # Rows and columns that the multiplexers have (scan_sequence.h).
 LINES_MAX: Final = 16
 # The pins change no later than this after the hold of a reading [cycles] (docs/timing.md).
-SELECT_CYCLES: Final = 120
+SELECT_CYCLES: Final = 104
 
 _CONSTANTS: Final = protocol.CONSTANTS
 # Clock cycles of an ADC clock, by accuracy (scan_plan.h).
