@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 
 from command_line import Run, assert_one_line, well
 from kneaded_skin import KneadedSkin
 from kneaded_skin import Scale as ScaleBelow
 from ohmskin.arrays import Float
 from ohmskin.calibrate import kneading
-from ohmskin.calibrate.kneading import Kneading
+from ohmskin.calibrate.kneading import Kneading, likely_wires
 from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.scale import Scale, fit_scale, printed_s, wrong_numbers
 from ohmskin.calibrate.sessions import joined
@@ -433,6 +433,33 @@ def test_few_presses_that_are_estimated_wrong_are_not_taken_for_wires() -> None:
     fit = TotalFit(totals._replace(rise=rise), slopes).fit()
     assert fit.presses_left_out == 0
     assert np.abs(fit.w[0] - usual).max() < 0.2
+
+
+@pytest.mark.parametrize(("ohm", "std_ohm"), [(100.0, 5.0), (500.0, 250.0), (200.0, 400.0)])
+def test_wires_are_a_mean_of_what_presses_do_not_exclude(ohm: float, std_ohm: float) -> None:
+    """Two layers of which presses tell this in ohms, and whose logs were expected about 150 ohm."""
+    held, centre, std = np.log(180.0), np.log(150.0), 1.5
+    precision = (180.0 / std_ohm) ** 2  # of the share by which a segment differs from that
+    covariance = 1 / (precision + std**-2)
+    step = covariance * (precision * (ohm / 180.0 - 1) + (centre - held) / std**2)
+    alike = np.ones(2)
+    mean, deviation = likely_wires(
+        held * alike, step * alike, covariance * np.eye(2), centre * alike, std * alike
+    )
+
+    def density(log_ohm: float) -> float:
+        return float(
+            np.exp(-0.5 * ((np.exp(log_ohm) - ohm) / std_ohm) ** 2)
+            * np.exp(-0.5 * ((log_ohm - centre) / std) ** 2)
+        )
+
+    powers = [
+        quad(lambda log_ohm, n=n: density(log_ohm) * log_ohm**n, -3, 10, points=[4, 5, 6])[0]
+        for n in range(3)
+    ]
+    expected = powers[1] / powers[0]
+    assert mean == pytest.approx(expected, abs=0.02)
+    assert deviation == pytest.approx(np.sqrt(powers[2] / powers[0] - expected**2), rel=0.05)
 
 
 def test_total_and_an_indenter_exclude_each_other(run: Run, tmp_path: Path) -> None:

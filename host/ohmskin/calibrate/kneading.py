@@ -25,6 +25,8 @@ wires change by dw, the estimated cells must change so that the currents stay:
 3 is the deviation that a touch may have (`UNLIMITED_STD`); without it, cells that the currents
 hardly show would change without limit. `TotalFit` takes these slopes and finds dw together with
 curve and gains. Then the scans are estimated again with the new wires, until these hardly change.
+Few presses tell little of the wires, so what is taken then is no maximum but the mean of all wires
+that they do not exclude (`likely_wires`).
 In the total force, a lead looks like hysteresis. So the leads are not found here: the estimator
 learns them from frames of several touches.
 """
@@ -79,6 +81,10 @@ CLOSE_STDS: Final = 0.7
 # Segments that nobody has told are at most this in the first trial [ohm]. Chosen: with wires that
 # are far too large, cells under much force conduct without limit, and the slopes tell nothing.
 START_OHM: Final = 50.0
+# The mean of the wires is that of so many trial values of each layer, up to so many deviations from
+# the most likely one, which is this share of what was held at least. Chosen: fine enough for 1 %,
+# and as far as the prior reaches.
+GRID_POINTS, GRID_STDS, LEAST_SHARE = 121, 6.0, 0.2
 # Deviation of the logs of segments that are held, in trials and in the last reading. Chosen: so
 # small that no scan teaches others.
 HELD_LOG_STD: Final = 1e-3
@@ -197,11 +203,12 @@ class Kneading:
             scale = fit.scale_
             step, covariance = fit.w
             stds = np.sqrt(covariance.diagonal())
-            w = w + step.clip(-LONGEST_STEP, LONGEST_STEP)
+            held, w = w, w + step.clip(-LONGEST_STEP, LONGEST_STEP)
             if is_first and (np.abs(step) < np.maximum(SHORT_STEP, stds)).all():
                 used, is_first = self._in_stretches(TRIAL_CELLS), False
             elif (np.abs(step) < np.maximum(LAST_STEP, CLOSE_STDS * stds)).all():
                 break
+        w, stds = likely_wires(held, step, covariance, centre, std)
         (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(w).tolist(), stds.tolist()
         lead_std = wires.lead_std_ohm
         found = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std)
@@ -296,6 +303,35 @@ class Kneading:
             log_siemens = solve_positive(system, by_wires)  # slopes of ports are those by log ohm
             slopes[:, n, pressed] = log_siemens.T * (siemens[pressed] / rises[n, pressed])
         return slopes
+
+
+def likely_wires(
+    held: Float, step: Float, covariance: Float, centre: Float, std: Float
+) -> tuple[Float, Float]:
+    """Mean and standard deviation of the logs of the segments, each (2,).
+
+    held: w for which the rises were estimated. step, covariance: what a fit with the prior found.
+    centre, std: of that prior.
+
+    Presses tell ohms: what they say is normal about the segments themselves, and the prior about
+    their logs. So where presses tell little, w of most likelihood is far above the mean: what they
+    cannot exclude reaches up to the largest segments, but down to none.
+    """
+    prior = np.diag(std**-2.0)
+    precision = np.linalg.inv(covariance)
+    pull = precision @ step - prior @ (centre - held)  # that of the presses alone
+    precision = precision - prior
+    share = np.maximum(1 + step, LEAST_SHARE)  # of the segments that were held
+    reach = np.linspace(-GRID_STDS, GRID_STDS, GRID_POINTS)[:, None]
+    axes = held + np.log(share) + reach * np.sqrt(covariance.diagonal()) / np.minimum(share, 1.0)
+    logs = np.stack(np.meshgrid(*axes.T, indexing="ij"), axis=-1).reshape(-1, 2)
+    more = np.expm1(logs - held)  # the change of a segment, over what was held
+    score = more @ pull - 0.5 * np.sum(more @ precision * more, axis=1)
+    score -= 0.5 * np.sum(((logs - centre) / std) ** 2, axis=1)
+    weight = np.exp(score - score.max())
+    weight /= weight.sum()
+    mean = weight @ logs
+    return mean, np.sqrt(weight @ (logs - mean) ** 2)
 
 
 def _held(wires: WireOhm) -> WireOhm:
