@@ -56,7 +56,8 @@ forces too early, so the delay of the scale is found together with h. Errors of 
 wires, too. So while wires are looked for, all rows of a press count as one (`WIRE_PRESS_ROWS`).
 
 Whoever reads forces later does not know t. So the curves that are kept are those of t = 0, and b h
-is added to their scatter. A calibration holds power laws: it gets those nearest to the curves.
+is added to their scatter. A calibration holds power laws: it gets those that are off from the
+curves by the fewest newtons.
 
 In the sum, the errors of single cells partly cancel, so one cell's force is wrong by a larger share
 than the sum is. If each cell is wrong by the share s1 of its own force, and all by chance, the sum
@@ -493,9 +494,9 @@ class TotalFit:
         top = float(np.quantile(rises, MOST_RISE_QUANTILE))
         x = top * np.geomspace(LEAST_RISE, 1.0, 50)
         log_contact = np.log(x / self._unit / self._loss(x / self._hard))
+        # Shares of a force count by that force: so the law is off by few newtons.
         force = np.exp(self._p[1] * log_contact)
-        weight = force / np.hypot(force, 0.1 * force[-1])
-        steeper, level = np.polyfit(np.log(x / self._unit), log_contact, 1, w=weight)
+        steeper, level = np.polyfit(np.log(x / self._unit), log_contact, 1, w=force)
         return float(level), float(steeper)
 
     def _residual_share(self) -> float:
