@@ -11,7 +11,8 @@ deviations of the answer say how much of it comes from the prior:
 
 The maximum of the posterior is found by a few Gauss-Newton steps (`full_fit`). They begin at the
 few touches that `sparse_fit` finds. If touches are many, as under a fingertip, they begin at the
-cells that `matrix` finds.
+cells that `matrix` finds. Where the first beginning ends at wires that nobody expects, the second
+one is tried, too, and the more probable end is the answer.
 
 `touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
 few touches. Where they do not explain the frame, its answer is that of `joint`. Without rest
