@@ -105,18 +105,20 @@ class WireOhm(NamedTuple):
         return better.for_curves_of(self)
 
     @property
-    def told_share(self) -> tuple[float, float, float]:
-        """How much of a difference from top, bottom and lead was there when they were told [1].
+    def told_share(self) -> float:
+        """How much of what wires differ from these by was so when they were told [1].
 
-        Layers differ because they were told wrongly, by their deviation, or because the skin has
-        been stretched since, by `LAYER_STD`. Leads do not stretch. What has no deviation counts as
-        told rightly: no press has measured it. Where nobody has told layers, all count so.
+        Wires differ because they were told wrongly, by the deviations of the layers, or because the
+        skin has been stretched since, by `LAYER_STD`. It is one number for layers and lead: frames
+        show whole paths better than which part of a path is long. What has no deviation counts as
+        told rightly, as no press has measured it.
         """
         if self.both is None:
-            return 0.0, 0.0, 0.0
-        top, bottom = ((std or 0.0) ** 2 for std in self[3:5])
-        lead = 0.0 if self.lead_std_ohm is None else 1.0
-        return top / (top + LAYER_STD**2), bottom / (bottom + LAYER_STD**2), lead
+            return 0.0
+        ohm = np.maximum(self.both, LEAST_WIRE_OHM)
+        told = ohm * np.array([std or 0.0 for std in self[3:5]])
+        stretched = LAYER_STD * ohm
+        return float(told @ told / (told @ told + stretched @ stretched))
 
     def of_curves(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
         """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
@@ -124,15 +126,14 @@ class WireOhm(NamedTuple):
         A press alone shows a cell and the wires up to it as one. So what wires were told wrongly by
         is in the curves of cells. What the skin was stretched by since is not.
         """
-        layers = []
-        for told, curve, share, ohm in zip(self[:2], self[6:8], self.told_share, now, strict=False):
+        left, layers = 1.0 - self.told_share, []
+        for told, curve, ohm in zip(self[:2], self[6:8], now, strict=False):
             told_ohm = max(UNKNOWN_WIRE_OHM if told is None else told, LEAST_WIRE_OHM)
             curve_ohm = told_ohm if curve is None else max(curve, LEAST_WIRE_OHM)
-            layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** (1.0 - share))
+            layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** left)
         told_ohm, _ = self.lead_or_usual(0.0)
         curve_ohm = told_ohm if self.curve_lead is None else self.curve_lead
-        lead = curve_ohm + (1.0 - self.told_share[2]) * (now[2] - told_ohm)
-        return layers[0], layers[1], max(lead, 0.0)
+        return layers[0], layers[1], max(curve_ohm + left * (now[2] - told_ohm), 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
         """These wires, which were learned later, for curves of presses that were told `before`."""
