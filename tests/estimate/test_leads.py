@@ -126,7 +126,7 @@ def test_fingertips_alone_show_the_lead_at_far_ends() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_lead_that_is_told_takes_no_place_of_weak_cells_under_a_fingertip(seed: int) -> None:
-    """Two hard fingertips of 60 came out up to five times as hard, behind a lead that is not there.
+    """Two hard fingertips of 60 came out up to 2.6 times as hard, behind a lead that is not there.
 
     The lead was told with a deviation, 150 ohm, as a calibration has it. Each frame is read alone.
     """

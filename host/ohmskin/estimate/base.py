@@ -48,9 +48,9 @@ class Estimate:
         not what the method neglects. By noise alone, about 58 % of cells lie within one, 98 %
         within two, because rounding is uniform.
     level: what a force is read from (R, C): cell_siemens; for `voltage`, a voltage over Vdd [1];
-        for `joint` and `touch`, the cell in series with what the wires up to it differ by, singly
-        from the means of their layers, and these from what was told wrongly [S]. A press alone
-        shows nothing of that, so the curve of a cell that was pressed has it in.
+        for `joint` and `touch`, the cell in series with its hidden wires [S]: what single wires
+        differ from the means of their layers by, and what the means were told wrongly by. A press
+        alone shows nothing of these, so the curve of a cell that was pressed has them in.
     level_std: its standard deviation (R, C), by noise alone: a calibration was learned through the
         same references.
     touched: which cells are touched (R, C); `Estimator.estimate` says by which rule.

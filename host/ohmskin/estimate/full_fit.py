@@ -384,7 +384,10 @@ class FullFit:
 
     @property
     def cost(self) -> float:
-        """What was minimised, at its minimum: the lower one of two fits is the more probable."""
+        """What was minimised, at its minimum: the lower one of two fits is the more probable.
+
+        It is without log det N. So only fits of one frame, with one prior and belief, compare.
+        """
         away = np.square((self.log_cells - self._prior.expected) / self._prior.std)
         by_cells = np.where(away < 1.0, away, 1.0 + np.log(np.maximum(away, 1.0)))
         by_readings = self.misfit * self._current.size + self._wires_square

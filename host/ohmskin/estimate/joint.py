@@ -236,11 +236,11 @@ class JointEstimator(Estimator):
         self._belief.expect_usual_leads(prior.is_crowded(start))
         fit = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
         if touches is not None and fit.moves_wires > MOVED_STDS:
-            # Few touches leave weak cells at rest, and wires may take the place of these: hard
-            # cells came out 1.6 times as large, behind a lead of 600 ohm that nothing else showed.
+            # Few touches leave weak cells at rest, and wires may take the place of these: a lead
+            # that nothing else shows, and hard cells that come out larger by half.
             start = self._start(prior, ports, None)
             other = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
-            if not other.message and other.cost < fit.cost:
+            if not other.message and (fit.message or other.cost < fit.cost):
                 fit = other
         spread_share = prior.spread_share(fit.log_cells)
         if spread_share > PALM_SHARE and fit_prior is not prior:
