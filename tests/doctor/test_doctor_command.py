@@ -239,7 +239,7 @@ def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path
         done = run("doctor", url, "--calibration", str(path), "--press", "--json", *more)
         assert [each["id"] for each in json.loads(done.out)["findings"]] == names
         assert done.code == len(names)
-    by_presses = told.nominal_wire_ohm._replace(path_log_std=0.9)
+    by_presses = told.nominal_wire_ohm._replace(top_log_std=0.9, bottom_log_std=0.9)
     replace(told, nominal_wire_ohm=by_presses).save(path)
     told_now = ("--wires", "100,200", "--leads", str(LEAD_OHM))
     assert run("doctor", url, *told_now, "--press", "--into", str(path)).code == 1
@@ -248,7 +248,7 @@ def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path
     assert (kept.top_log_std, kept.bottom_log_std) == pytest.approx((0.04, 0.04), abs=0.035)
     assert kept.lead == LEAD_OHM
     # The curves are of the wires that presses showed, so badly that a tenth alone is stretch.
-    assert kept[7:9] == pytest.approx((100 * 1.5**0.1, 200 * 1.5**0.1), rel=0.01)
+    assert kept[6:8] == pytest.approx((100 * 1.5**0.1, 200 * 1.5**0.1), rel=0.01)
     assert_one_line(run("doctor", url, "--into", str(path)), "--press")
 
 

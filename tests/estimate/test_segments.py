@@ -101,8 +101,8 @@ def pressed_before_and_after(
 @pytest.mark.parametrize(
     ("told", "times"),
     [
-        (WireOhm(250.0, 500.0, 0.0, 0.7, 0.7, 1.0, 0.7), 1.2),
-        (WireOhm(625.0, 1250.0, 0.0, 0.7, 0.7, 1.0, 0.7), 1 / 1.02),
+        (WireOhm(250.0, 500.0, 0.0, 0.7, 0.7, 1.0), 1.2),
+        (WireOhm(625.0, 1250.0, 0.0, 0.7, 0.7, 1.0), 1 / 1.02),
     ],
 )
 def test_what_wires_were_told_wrongly_by_is_no_part_of_a_force(
@@ -114,7 +114,7 @@ def test_what_wires_were_told_wrongly_by_is_no_part_of_a_force(
         change = late.cell_siemens[cell] / first.cell_siemens[cell]
         assert (change > times) if times > 1 else (change < times)
         assert late.level[cell] == pytest.approx(first.level[cell], rel=0.1)
-        assert anew.level[cell] == pytest.approx(first.level[cell], rel=0.3)
+        assert anew.level[cell] == pytest.approx(first.level[cell], rel=0.25)
         # Nor does its deviation, in ohm, have in it how badly they were known.
         level_std_ohm = late.level_std[cell] / late.level[cell] ** 2
         assert level_std_ohm < 0.95 * late.cell_siemens_std[cell] / late.cell_siemens[cell] ** 2
@@ -131,7 +131,7 @@ def test_a_lead_that_no_press_has_measured_is_in_no_curve(method: str) -> None:
 def test_what_a_skin_is_stretched_by_is_no_part_of_a_level() -> None:
     """Wires that were well known when cells were pressed, and have doubled since."""
     trial = random_trial(4, 4, 4, 40, seed=1, wire_ohm=LONG)
-    told = WireOhm(0.5 * LONG[0], 0.5 * LONG[1], 0.0, 0.02, 0.02, 1.0, 0.02)
+    told = WireOhm(0.5 * LONG[0], 0.5 * LONG[1], 0.0, 0.02, 0.02, 1.0)
     given = trial.rounded(10)
     estimator = make_estimator("joint", replace(given.knowledge(0), nominal_wire_ohm=told))
     for ratio in given.ratio:
@@ -143,7 +143,7 @@ def test_what_a_skin_is_stretched_by_is_no_part_of_a_level() -> None:
 
 def test_a_region_leaves_the_levels_of_other_cells_as_they_were() -> None:
     """Also if the last whole frame has moved what is believed of the wires."""
-    told = WireOhm(0.5 * LONG[0], 0.5 * LONG[1], 0.0, 0.7, 0.7, 1.0, 0.7)
+    told = WireOhm(0.5 * LONG[0], 0.5 * LONG[1], 0.0, 0.7, 0.7, 1.0)
     given = random_trial(4, 4, 4, 4, seed=1, wire_ohm=LONG).rounded(10)
     estimator = make_estimator("joint", replace(given.knowledge(0), nominal_wire_ohm=told))
     for ratio in given.ratio:
@@ -155,12 +155,12 @@ def test_a_region_leaves_the_levels_of_other_cells_as_they_were() -> None:
 
 
 def test_wires_that_are_learned_twice_are_still_those_of_the_curves() -> None:
-    told = WireOhm(100.0, 200.0, 80.0, 0.3, 0.3, 50.0, 0.3)
-    once = WireOhm(144.0, 200.0, 200.0, 0.3, 0.3, 10.0, 0.3).for_curves_of(told)
+    told = WireOhm(100.0, 200.0, 80.0, 0.3, 0.3, 50.0)
+    once = WireOhm(144.0, 200.0, 200.0, 0.3, 0.3, 10.0).for_curves_of(told)
     # Half of the change was there when they were told: by a deviation of 0.3, as of stretch.
-    assert once[7:] == pytest.approx((120.0, 200.0, 140.0))
+    assert once[6:] == pytest.approx((120.0, 200.0, 140.0))
     twice = WireOhm(144.0, 450.0, 90.0, 0.1, 0.1, 5.0).for_curves_of(once)
-    assert twice[7:] == pytest.approx((120.0, 300.0, 85.0))
+    assert twice[6:] == pytest.approx((120.0, 300.0, 85.0))
     assert told.for_curves_of(NO_WIRES) == told  # nobody knows what the curves were made with
     with pytest.raises(ValueError, match="need each other, and both layers"):
         WireOhm(100.0, curve_top=100.0, curve_bottom=100.0, curve_lead=0.0).check()

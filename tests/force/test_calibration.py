@@ -111,7 +111,7 @@ def test_round_trip_is_bit_for_bit(tmp_path: Path, pressed: int) -> None:
 
 def test_a_tare_is_the_rest_until_it_is_undone(tmp_path: Path) -> None:
     before = calibration()
-    wires = WireOhm(150.0, 200.0, 80.0, 0.1, 0.1, 20.0, 0.2, 100.0, 300.0, 0.0)
+    wires = WireOhm(150.0, 200.0, 80.0, 0.1, 0.1, 20.0, 100.0, 300.0, 0.0)
     tared = replace(before, tare=rest(3, "2025-03-02T08:00:00+00:00"), nominal_wire_ohm=wires)
     path = tmp_path / "skin.json"
     tared.save(path)

@@ -61,7 +61,7 @@ def test_scans_carry_forces_and_contacts(method: str) -> None:
 
 def test_a_cell_without_a_curve_of_its_own_has_the_hidden_wires_of_others() -> None:
     """Of this skin, presses were told twice the wires, and no cell has a curve of its own."""
-    wires = WireOhm(2 * TOP_WIRE_OHM, 2 * BOTTOM_WIRE_OHM, 80.0, 0.7, 0.7, 20.0, 0.7)
+    wires = WireOhm(2 * TOP_WIRE_OHM, 2 * BOTTOM_WIRE_OHM, 80.0, 0.7, 0.7, 20.0)
     of_skin = replace(of_scene("ghost", method="joint"), nominal_wire_ohm=wires)
     assert of_skin.model.pooled.all()
     with ohmskin.open(GHOST, calibration=of_skin) as board:

@@ -66,7 +66,7 @@ def test_its_skin_is_that_of_the_calibration() -> None:
 
 def test_its_wires_are_those_of_the_curves() -> None:
     """Others were learned since the presses."""
-    wires = WireOhm(250.0, 500.0, 80.0, 0.05, 0.05, 20.0, None, 100.0, 200.0, 80.0)
+    wires = WireOhm(250.0, 500.0, 80.0, 0.05, 0.05, 20.0, 100.0, 200.0, 80.0)
     skin = ohmskin.SimulatedSkin(replace(of_scene("rest"), nominal_wire_ohm=wires))
     read_n = [skin.step(fingertip(6.0), 0.01 * k).force_n.sum() for k in range(10)]
     assert read_n == pytest.approx(10 * [6.0], rel=0.03)

@@ -212,12 +212,7 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
     lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
     top_std, bottom_std = std[:2].tolist()
-    # Errors of layers and lead nearly cancel in a path: presses show the whole of it.
-    parts = 0.5 * np.array([(knowledge.columns + 1) * top_ohm, (knowledge.rows + 1) * bottom_ohm])
-    by_p = np.array([*parts, 2 * UNKNOWN_LEAD_OHM])
-    path_std = float(np.sqrt(by_p @ covariance[:3, :3] @ by_p) / np.linalg.norm(parts))
-    stds = top_std, bottom_std, lead_std_ohm, path_std
-    wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, *stds)
+    wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std_ohm)
     presses = np.unique(readings.press).size
     return FoundWires(wires, knowledge.nominal_wire_ohm, presses, layers)
 

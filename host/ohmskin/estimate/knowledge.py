@@ -53,8 +53,6 @@ class WireOhm(NamedTuple):
         for all lines alike [ohm]; 0: nothing.
     top_log_std, bottom_log_std: standard deviations of the logs of these, where they were measured.
     lead_std_ohm: the same of the lead [ohm]. A lead may be next to nothing, which has no log.
-    path_log_std: deviation of the wires up to a cell in the middle of the skin, as presses showed
-        them, over the length of that path: the root of the sum of squares of both layers' parts.
     curve_top, curve_bottom, curve_lead: the wires that the levels of the curves were computed with
         [ohm], if others have been learned since; None: top, bottom and lead.
     """
@@ -65,7 +63,6 @@ class WireOhm(NamedTuple):
     top_log_std: float | None = None
     bottom_log_std: float | None = None
     lead_std_ohm: float | None = None
-    path_log_std: float | None = None
     curve_top: float | None = None
     curve_bottom: float | None = None
     curve_lead: float | None = None
@@ -75,8 +72,8 @@ class WireOhm(NamedTuple):
         for name, number in zip(WIRE_FIELDS, self, strict=True):
             if number is not None and not 0 <= number <= MAX_OHM:
                 raise ValueError(f"{name} is {number:g}, it must be from 0 to {MAX_OHM:g}")
-        if any(number is not None for number in self[7:]) and None in (*self[:2], *self[7:]):
-            raise ValueError(f"{', '.join(WIRE_FIELDS[7:])} need each other, and both layers")
+        if any(number is not None for number in self[6:]) and None in (*self[:2], *self[6:]):
+            raise ValueError(f"{', '.join(WIRE_FIELDS[6:])} need each other, and both layers")
         return self
 
     def lead_or_usual(self, std_ohm: float) -> tuple[float, float]:
@@ -108,16 +105,19 @@ class WireOhm(NamedTuple):
         return better.for_curves_of(self)
 
     @property
-    def told_share(self) -> float:
-        """How much of what wires differ from these by was so when they were told [1].
+    def told_share(self) -> tuple[float, float, float]:
+        """How much of what top, bottom and lead differ by was so when they were told [1].
 
-        Wires differ because presses showed them wrongly, by the deviation of a path, or because the
-        skin has been stretched since, by `LAYER_STD`. It is one number for layers and lead: frames
-        show whole paths better than which part of a path is long. What no press has shown counts as
-        told rightly.
+        Layers differ because they were told wrongly, by their deviation, or because the skin has
+        been stretched since, by `LAYER_STD`. Leads do not stretch. But presses show whole paths: so
+        the error of the lead nearly cancels that of the layer that was known less, and has the
+        share of that. What has no deviation counts as told rightly, as no press has measured it.
         """
-        square = (self.path_log_std or 0.0) ** 2
-        return square / (square + LAYER_STD**2)
+        if self.both is None:
+            return 0.0, 0.0, 0.0
+        squares = [(std or 0.0) ** 2 for std in self[3:5]]
+        top, bottom = (square / (square + LAYER_STD**2) for square in squares)
+        return top, bottom, max(top, bottom)
 
     def of_curves(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
         """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
@@ -125,14 +125,15 @@ class WireOhm(NamedTuple):
         A press alone shows a cell and the wires up to it as one. So what wires were told wrongly by
         is in the curves of cells. What the skin was stretched by since is not.
         """
-        left, layers = 1.0 - self.told_share, []
-        for told, curve, ohm in zip(self[:2], self[7:9], now, strict=False):
+        layers = []
+        *shares, of_lead = self.told_share
+        for told, curve, share, ohm in zip(self[:2], self[6:8], shares, now, strict=False):
             told_ohm = max(UNKNOWN_WIRE_OHM if told is None else told, LEAST_WIRE_OHM)
             curve_ohm = told_ohm if curve is None else max(curve, LEAST_WIRE_OHM)
-            layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** left)
+            layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** (1.0 - share))
         told_ohm, _ = self.lead_or_usual(0.0)
         curve_ohm = told_ohm if self.curve_lead is None else self.curve_lead
-        return layers[0], layers[1], max(curve_ohm + left * (now[2] - told_ohm), 0.0)
+        return layers[0], layers[1], max(curve_ohm + (1.0 - of_lead) * (now[2] - told_ohm), 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
         """These wires, which were learned later, for curves of presses that were told `before`."""
@@ -156,7 +157,6 @@ WIRE_FIELDS: Final = (
     "top_wire_log_std",
     "bottom_wire_log_std",
     "lead_std_ohm",
-    "path_log_std",
     "curve_top_wire_ohm",
     "curve_bottom_wire_ohm",
     "curve_lead_ohm",

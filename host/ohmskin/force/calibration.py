@@ -18,8 +18,6 @@ nominal_lead_ohm                           from a multiplexer's common pin to th
 top_wire_log_std                           standard deviations of the logarithms of both segments;
 bottom_wire_log_std                        null: not measured
 lead_std_ohm                               standard deviation of the lead [ohm]; null: not measured
-path_log_std                               that of the wires up to a cell, over their length, as
-                                           presses showed them; absent or null: they did not
 curve_top_wire_ohm                         the wires that the curves are of [ohm], if others were
 curve_bottom_wire_ohm                      learned since the presses; absent or null: those above
 curve_lead_ohm

@@ -58,7 +58,7 @@ class SimulatedSkin:
         rows, columns, wires = calibration.rows, calibration.columns, calibration.nominal_wire_ohm
         if wires.curve_top is not None and calibration.mode != "far":
             # Its cells are those of the curves, and so are the wires up to them.
-            wires = WireOhm(*wires[7:], *wires[3:6])
+            wires = WireOhm(*wires[6:], *wires[3:6])
         told = (wires.top, TOP_WIRE_OHM), (wires.bottom, BOTTOM_WIRE_OHM), (wires.lead, LEAD_OHM)
         top, bottom, lead = (usual if known is None else known for known, usual in told)
         drawn = Scene("rest", rows, columns, seed=seed).rest
