@@ -53,7 +53,7 @@ from ohmskin.estimate.port_noise import MEDIAN_CHI2, USUAL_STDS
 # Deviation of beta before any frame [V/Vdd]. Chosen: a code of 10 bits. The ATmega328P's data sheet
 # gives 0.5 LSB as typical, at an ADC clock of 200 kHz, and nothing for faster ones.
 BOW_STD_RATIO: Final = 0.001
-# Frames whose noise is averaged. Chosen: v is then known to some percent.
+# Frames taken whose noise is averaged. Chosen: v is then known to some percent.
 _NOISE_FRAMES: Final = 30
 
 
@@ -63,7 +63,7 @@ def bow_shape(ratio: Float) -> Float:
 
 
 class BoardShown(NamedTuple):
-    """What whole frames have shown of the board so far.
+    """What the whole frames that were taken have shown of the board so far.
 
     offset_ratio: of the node of each reading, where phi is 0 (4,) [V/Vdd].
     bow_ratio: beta [V/Vdd].
@@ -88,7 +88,7 @@ class MirrorReadings:
         self._product = self._square = 0.0
 
     def take(self, near: NearReadings, *, is_live: bool) -> BoardShown:
-        """One more frame, and what all have shown with it.
+        """One more frame, and what all that were taken have shown with it.
 
         is_live: False for readings at rest, which may be a mean that has no noise.
         """

@@ -7,8 +7,9 @@ Symbols are those of `port_currents` and `port_noise`; K are the readings of a c
     s_I^2 = v_I / sum R_k^2 .
 
 Fewer than four readings do not show the offset o_k of each node, nor v, nor the bow beta of the
-converter, which four readings cancel. Frames in which all was read show them (`port_mirror`): o_k
-is that of the last one, v and beta are those of all of them. beta 4 y_k (1 - y_k) counts to b_k.
+converter, which four readings cancel. Frames in which all was read show them (`port_mirror`). Of
+several in a row, the last one before a frame of fewer readings is asked: o_k is that of the last
+one asked, v and beta are those of all that were. beta 4 y_k (1 - y_k) counts to b_k.
 Before there was such a frame, the rest readings stand in for it. They may be a mean of many scans,
 which shows hardly any noise, and then v is too small. Where neither was read, o_k is 0, and of two
 or more readings,
@@ -125,10 +126,10 @@ class PartialEnds:
         self.reset()
 
     def _of_board(self) -> BoardShown:
-        """What all whole frames have shown of the board.
+        """What whole frames have shown of the board: of several in a row, the last one.
 
         Only the last of several whole frames is asked, and only now: modes that read all need none
-        of this.
+        of this. So 30 whole frames and then one of fewer readings count as one.
         """
         if self._last.near is not None:
             self._board = self._mirrors.take(self._last.near, is_live=self._last.is_live)
