@@ -35,7 +35,15 @@ What moves x and 1 - x alike is a function of (2 x - 1)^2, and the first term of
 is a bow: it is beta where x is 1/2, and 0 at both ends of the scale. Four readings of a cell cancel
 it; one does not. It belongs to the converter, so all frames tell the same beta,
 
-    beta = sum w m (phi - mean phi) / (sum w (phi - mean phi)^2 + v / BOW_STD_RATIO^2) .
+    beta = sum w m (phi - mean phi) / (sum w (phi - mean phi)^2 + v / BOW_STD_RATIO^2) ,
+
+but it is at most _MOST_BOW_STDS BOW_STD_RATIO, either way. Other causes make m depend on phi, too.
+So that they are forgotten, each frame takes a share off both sums over the frames before,
+
+    i / (1 + i) / _BOARD_FRAMES ,  i = BOW_STD_RATIO^2 / v sum w (phi - mean phi)^2 of this frame.
+
+A frame with i far below 1 shows hardly anything of beta, as one of an untouched skin: it takes
+hardly anything off.
 
 m has the variance v / w of noise, w = 4 / (1 + q^2). So the mean of w (m - its median)^2 over the
 usual cells is v.
@@ -53,8 +61,11 @@ from ohmskin.estimate.port_noise import MEDIAN_CHI2, USUAL_STDS
 # Deviation of beta before any frame [V/Vdd]. Chosen: a code of 10 bits. The ATmega328P's data sheet
 # gives 0.5 LSB as typical, at an ADC clock of 200 kHz, and nothing for faster ones.
 BOW_STD_RATIO: Final = 0.001
-# Frames taken whose noise is averaged. Chosen: v is then known to some percent.
-_NOISE_FRAMES: Final = 30
+# Largest bow that is believed, in deviations. Chosen: a larger one has another cause.
+_MOST_BOW_STDS: Final = 3.0
+# Frames taken whose noise is averaged, and after which a bow that they show has mostly replaced the
+# one before. Chosen: v is then known to some percent, and a bow to a tenth of an LSB of 10 bits.
+_BOARD_FRAMES: Final = 30
 
 
 def bow_shape(ratio: Float) -> Float:
@@ -119,18 +130,25 @@ class MirrorReadings:
     @property
     def _bow_ratio(self) -> float:
         """beta [V/Vdd]."""
-        noise = max(self._noise, 2.0 * self._rounding)
-        return self._product / (self._square + noise / BOW_STD_RATIO**2)
+        bow = self._product / (self._square + self._unknown_bow)
+        return min(max(bow, -_MOST_BOW_STDS * BOW_STD_RATIO), _MOST_BOW_STDS * BOW_STD_RATIO)
+
+    @property
+    def _unknown_bow(self) -> float:
+        """v / BOW_STD_RATIO^2."""
+        return max(self._noise, 2.0 * self._rounding) / BOW_STD_RATIO**2
 
     def _learn_bow(self, shape: Float, common: Float, weight: Float) -> None:
         """From phi, m and w of k cells."""
         away = shape - np.average(shape, weights=weight)
-        self._product += float(np.sum(weight * common * away))
-        self._square += float(np.sum(weight * away**2))
+        square = float(np.sum(weight * away**2))
+        kept = 1.0 - square / (square + self._unknown_bow) / _BOARD_FRAMES
+        self._product = kept * self._product + float(np.sum(weight * common * away))
+        self._square = kept * self._square + square
 
     def _learn_noise(self, square: Float) -> None:
         """From w (m - its median)^2 of k cells."""
         level = max(self._rounding, float(np.median(square)) / MEDIAN_CHI2[1])
         usual = square[square <= USUAL_STDS**2 * level]
-        self._frames = min(self._frames + 1, _NOISE_FRAMES)
+        self._frames = min(self._frames + 1, _BOARD_FRAMES)
         self._noise += (float(usual.mean()) - self._noise) / self._frames
