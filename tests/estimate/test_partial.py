@@ -416,3 +416,24 @@ def test_a_bow_is_not_forgotten_while_nobody_touches() -> None:
 
     assert off_by(touched, 40) < 0.5
     assert off_by(rest, 200) < 0.7
+
+
+@pytest.mark.parametrize("mode", ["half", "quick"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 8), (8, 8)])
+def test_deviations_of_noise_are_stated_on_skins_of_any_size(
+    size: tuple[int, int], mode: str
+) -> None:
+    """Few cells hardly show noise and offsets: both are fitted to the cells that show them."""
+    random, errors = np.random.default_rng(9), []
+    for _ in range(40 if np.prod(size) < 64 else 5):
+        current = np.exp(random.normal(-3.0, 0.7, size)).clip(0.0, 0.45)
+        rest = np.mean([a_board(0.3 * current, random) for _ in range(30)], axis=0)
+        reader = PortReader(SkinKnowledge(*size, adc_bits=10, rest_ratio=rest))
+        for number in range(30):
+            reader.read(a_board(current, random), in_order=True)
+            frame = np.full((*size, 4), np.nan)
+            frame[..., READ[mode]] = a_board(current, random)[..., READ[mode]]
+            found = reader.read(frame, in_order=True)
+            if number >= 5:
+                errors.append((found.current - current / 3e4) / found.current_std)
+    assert 0.8 < np.std(errors) < 1.3

@@ -45,8 +45,15 @@ So that they are forgotten, each frame takes a share off both sums over the fram
 A frame with i far below 1 shows hardly anything of beta, as one of an untouched skin: it takes
 hardly anything off.
 
-m has the variance v / w of noise, w = 4 / (1 + q^2). So the mean of w (m - its median)^2 over the
-usual cells is v.
+m has the variance v / w of noise, w = 4 / (1 + q^2). So v is, over usual cells of several frames,
+
+    v = sum w (m - beta phi - its median)^2 / (cells - h) ,
+
+with h what is fitted to each frame: 1 for its median, and its share in the sum that beta divides
+by. A skin with a single cell has no other to compare it with. There v is by how the residuals
+change from frame to frame, and in the first frame by what is left of them without both offsets.
+The offsets are o = (their mean) +- (their difference) / 2, of variances v / sum w and v / cells.
+(A median has up to pi / 2 of the former. Where that is much, cells are few, and it has less.)
 """
 
 from typing import Final, NamedTuple
@@ -66,6 +73,10 @@ _MOST_BOW_STDS: Final = 3.0
 # Frames taken whose noise is averaged, and after which a bow that they show has mostly replaced the
 # one before. Chosen: v is then known to some percent, and a bow to a tenth of an LSB of 10 bits.
 _BOARD_FRAMES: Final = 30
+# With fewer cells, all are usual. Chosen: so few hardly show which of them has a cause of its own.
+_FEW_CELLS: Final = 16
+# Sign of the difference of both offsets in that of each reading.
+APART_SIGN: Final = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def bow_shape(ratio: Float) -> Float:
@@ -79,11 +90,13 @@ class BoardShown(NamedTuple):
     offset_ratio: of the node of each reading, where phi is 0 (4,) [V/Vdd].
     bow_ratio: beta [V/Vdd].
     noise: v; 0: not known.
+    offset_share: variances of the offsets' mean and of their difference, over v.
     """
 
     offset_ratio: Float
     bow_ratio: float = 0.0
     noise: float = 0.0
+    offset_share: tuple[float, float] = (0.0, 0.0)
 
 
 class MirrorReadings:
@@ -95,8 +108,9 @@ class MirrorReadings:
 
     def reset(self) -> None:
         """Forget the frames before."""
-        self._noise, self._frames = 0.0, 0
+        self._misfit, self._degrees, self._frames = 0.0, 0.0, 0
         self._product = self._square = 0.0
+        self._residual: Float | None = None
 
     def take(self, near: NearReadings, *, is_live: bool) -> BoardShown:
         """One more frame, and what all that were taken have shown with it.
@@ -118,14 +132,22 @@ class MirrorReadings:
         common = 0.5 * (row + column - share * (apart - nodes_apart))
         weight = 4.0 / (1.0 + share**2)
         shape = bow_shape(near.ratio).mean(axis=2)
-        self._learn_bow(shape[sound], common[sound], weight[sound])
+        bow_share = self._learn_bow(shape[sound], common[sound], weight[sound])
         flat = common - self._bow_ratio * shape
         middle = float(np.median(flat[sound]))
-        if is_live:
-            self._learn_noise((weight * (flat - middle) ** 2)[sound])
-        offset = middle + 0.5 * nodes_apart * np.array([1.0, -1.0, -1.0, 1.0])
+        if is_live and sound.size > 1:
+            self._learn_noise((weight * (flat - middle) ** 2)[sound], 1.0 + bow_share)
+        elif is_live:
+            self._learn_noise_of_one(near.residual, residual)
+        offset = middle + 0.5 * nodes_apart * APART_SIGN
         offset = np.clip(offset, -MOST_OFFSET_RATIO, MOST_OFFSET_RATIO)
-        return BoardShown(offset, self._bow_ratio, self._noise)
+        shares = 1.0 / float(weight[sound].sum()), 1.0 / int(sound.sum())
+        return BoardShown(offset, self._bow_ratio, self._noise, shares)
+
+    @property
+    def _noise(self) -> float:
+        """v, or 0."""
+        return self._misfit / self._degrees if self._degrees else 0.0
 
     @property
     def _bow_ratio(self) -> float:
@@ -138,17 +160,33 @@ class MirrorReadings:
         """v / BOW_STD_RATIO^2."""
         return max(self._noise, 2.0 * self._rounding) / BOW_STD_RATIO**2
 
-    def _learn_bow(self, shape: Float, common: Float, weight: Float) -> None:
-        """From phi, m and w of k cells."""
+    def _learn_bow(self, shape: Float, common: Float, weight: Float) -> float:
+        """From phi, m and w of k cells. Returns the share of beta that this frame decides."""
         away = shape - np.average(shape, weights=weight)
         square = float(np.sum(weight * away**2))
         kept = 1.0 - square / (square + self._unknown_bow) / _BOARD_FRAMES
         self._product = kept * self._product + float(np.sum(weight * common * away))
         self._square = kept * self._square + square
+        return square / (self._square + self._unknown_bow)
 
-    def _learn_noise(self, square: Float) -> None:
-        """From w (m - its median)^2 of k cells."""
+    def _learn_noise(self, square: Float, fitted: float) -> None:
+        """From w (m - beta phi - its median)^2 of k cells; fitted: h."""
         level = max(self._rounding, float(np.median(square)) / MEDIAN_CHI2[1])
-        usual = square[square <= USUAL_STDS**2 * level]
+        if square.size >= _FEW_CELLS:
+            square = square[square <= USUAL_STDS**2 * level]
+        if square.size > fitted:
+            self._average(float(square.sum()), square.size - fitted)
+
+    def _learn_noise_of_one(self, residual: Float, with_offset: Float) -> None:
+        """From the residuals of a single cell (1, 1, 4), without offsets and with them."""
+        if self._residual is None:
+            self._average(float(np.sum(residual**2)), 1.0)
+        else:
+            self._average(0.5 * float(np.sum((with_offset - self._residual) ** 2)), 3.0)
+        self._residual = with_offset
+
+    def _average(self, misfit: float, degrees: float) -> None:
+        """One more frame counts to v."""
         self._frames = min(self._frames + 1, _BOARD_FRAMES)
-        self._noise += (float(usual.mean()) - self._noise) / self._frames
+        self._misfit += (misfit - self._misfit) / self._frames
+        self._degrees += (degrees - self._degrees) / self._frames

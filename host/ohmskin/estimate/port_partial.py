@@ -38,6 +38,13 @@ The factor max(...) is the share of v_cell that is not noise. Where hardly a cel
 differs by more than noise, no lines charge, and n keeps the correction from following noise. With k
 for what I_A - I_B is multiplied by, its noise adds v k^2 (R_A^-2 + R_B^-2) sum R_k^2 to v_I.
 
+Offsets have noise, too. With V_m and V_d the variances of their mean and their difference
+(`port_mirror`), and t_k = +1 for readings of the row's node and -1 for those of the column's,
+
+    (V_m (sum s_k R_k)^2 + V_d / 4 (sum t_k s_k R_k)^2) / sum R_k^2
+
+is added to v_I. It matters where cells are few.
+
 A port that was not read keeps its last current. Its deviation grows by `STALE_SHARE` of the current
 with each frame since then.
 """
@@ -56,7 +63,7 @@ from ohmskin.circuit.configurations import (
 )
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import NearReadings, PortCurrents, row_share
-from ohmskin.estimate.port_mirror import BoardShown, MirrorReadings, bow_shape
+from ohmskin.estimate.port_mirror import APART_SIGN, BoardShown, MirrorReadings, bow_shape
 from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE
 
 # Share of its current by which a port that is not read may change from frame to frame. Chosen: by
@@ -166,6 +173,9 @@ class PartialEnds:
                 taken = (first - 1 + weight) * charged
                 current -= taken * (by_each[..., 0] - by_each[..., 1])
                 error += noise * taken**2 * square_ohm * float(np.sum(slope**-2.0))
+        of_mean, of_apart = board.offset_share
+        offset = of_mean * slope.sum() ** 2 + 0.25 * of_apart * (slope @ APART_SIGN[kinds]) ** 2
+        error = error + noise * offset / square_ohm
         std = np.broadcast_to(np.sqrt(error / square_ohm), current.shape)
         is_read, last = ~np.isnan(current), self._last.ports
         ports = PortCurrents(
