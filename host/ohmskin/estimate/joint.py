@@ -335,7 +335,7 @@ class JointEstimator(Estimator):
             self._hidden_ohm = wires.hidden_path_ohm
         level = in_series(cell_ohm, self._hidden_ohm)
         level_std = std
-        if any(belief.told.told_share):
+        if belief.told.told_share:
             parts = belief.parts_of_level(*parts)
             level_std, _ = siemens_std(-fit.log_cells, *parts, belief.stds(), series_ohm)
         level_std = level_std * (level * cell_ohm) ** 2  # cell and level have the same error in ohm

@@ -105,19 +105,20 @@ class WireOhm(NamedTuple):
         return better.for_curves_of(self)
 
     @property
-    def told_share(self) -> tuple[float, float, float]:
-        """How much of what top, bottom and lead differ by was so when they were told [1].
+    def told_share(self) -> float:
+        """How much of what wires differ from these by was so when they were told [1].
 
-        Layers differ because they were told wrongly, by their deviation, or because the skin has
-        been stretched since, by `LAYER_STD`. Leads do not stretch. But presses show whole paths: so
-        the error of the lead nearly cancels that of the layer that was known less, and has the
-        share of that. What has no deviation counts as told rightly, as no press has measured it.
+        Wires differ because they were told wrongly, by the deviations of the layers, or because the
+        skin has been stretched since, by `LAYER_STD`. It is one number for layers and lead: frames
+        show whole paths better than which part of a path is long. A skin is stretched as a whole,
+        and presses that take too much for the lead take too little for both layers: so either adds
+        up over the layers. What has no deviation counts as told rightly, as no press measured it.
         """
         if self.both is None:
-            return 0.0, 0.0, 0.0
-        squares = [(std or 0.0) ** 2 for std in self[3:5]]
-        top, bottom = (square / (square + LAYER_STD**2) for square in squares)
-        return top, bottom, max(top, bottom)
+            return 0.0
+        ohm = np.maximum(self.both, LEAST_WIRE_OHM)
+        square = float(ohm @ [std or 0.0 for std in self[3:5]]) ** 2
+        return square / (square + (LAYER_STD * float(ohm.sum())) ** 2)
 
     def of_curves(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
         """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
@@ -125,15 +126,14 @@ class WireOhm(NamedTuple):
         A press alone shows a cell and the wires up to it as one. So what wires were told wrongly by
         is in the curves of cells. What the skin was stretched by since is not.
         """
-        layers = []
-        *shares, of_lead = self.told_share
-        for told, curve, share, ohm in zip(self[:2], self[6:8], shares, now, strict=False):
+        left, layers = 1.0 - self.told_share, []
+        for told, curve, ohm in zip(self[:2], self[6:8], now, strict=False):
             told_ohm = max(UNKNOWN_WIRE_OHM if told is None else told, LEAST_WIRE_OHM)
             curve_ohm = told_ohm if curve is None else max(curve, LEAST_WIRE_OHM)
-            layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** (1.0 - share))
+            layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** left)
         told_ohm, _ = self.lead_or_usual(0.0)
         curve_ohm = told_ohm if self.curve_lead is None else self.curve_lead
-        return layers[0], layers[1], max(curve_ohm + (1.0 - of_lead) * (now[2] - told_ohm), 0.0)
+        return layers[0], layers[1], max(curve_ohm + left * (now[2] - told_ohm), 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
         """These wires, which were learned later, for curves of presses that were told `before`."""

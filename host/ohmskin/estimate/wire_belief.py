@@ -486,11 +486,10 @@ class WireBelief(ABC):
 
         log_std, wires_log_std, leads_log_std: as `prior.siemens_std` takes them, (RC,).
         """
-        *layers, lead = self.told.told_share
-        share = min(layers)
-        gone = share * wires_log_std**2 + lead * leads_log_std**2
-        own = np.sqrt(np.maximum(log_std**2 - gone, 0.0))
-        return own, (1.0 - share) ** 0.5 * wires_log_std, (1.0 - lead) ** 0.5 * leads_log_std
+        share = self.told.told_share
+        gone = share * (wires_log_std**2 + leads_log_std**2)
+        own, left = np.sqrt(np.maximum(log_std**2 - gone, 0.0)), (1.0 - share) ** 0.5
+        return own, left * wires_log_std, left * leads_log_std
 
     def believed_wires(self) -> SkinWires:
         """The wires as believed, for answers whose fit took them so: made once for each belief."""
