@@ -12,6 +12,7 @@ from network import SkinCircuit
 from ohmskin.arrays import Float
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator
+from ohmskin.estimate.port_currents import MOST_OFFSET_RATIO
 from ohmskin.estimate.port_partial import STALE_SHARE
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.link.codes import quantise, ratio_from_codes
@@ -437,3 +438,113 @@ def test_deviations_of_noise_are_stated_on_skins_of_any_size(
             if number >= 5:
                 errors.append((found.current - current / 3e4) / found.current_std)
     assert 0.8 < np.std(errors) < 1.3
+
+
+@pytest.mark.parametrize("rest_is_known", [True, False])
+def test_a_reader_that_was_reset_answers_as_a_fresh_one(rest_is_known: bool) -> None:
+    """After frames of a board with a bow, noise and offsets."""
+    random = np.random.default_rng(10)
+    rest, touched = pressed(random)
+    known = knowledge(a_board(rest, random) if rest_is_known else None)
+    used, fresh = PortReader(known), PortReader(known)
+    for _ in range(20):
+        for read in (READ["near"], READ["half"], READ["quick"]):
+            frame = a_board(touched, random, 3.0, 2.5, (4.0, -4.0))
+            used.read(of_region(frame, slice(None), slice(None), read), in_order=True)
+    used.reset()
+    for mode in ("quick", "half", "near", "quick", "half"):
+        frame = of_region(a_board(touched, random), slice(None), slice(None), READ[mode])
+        again, first = (reader.read(frame, in_order=True) for reader in (used, fresh))
+        np.testing.assert_array_equal(again.current, first.current, err_msg=mode)
+        np.testing.assert_array_equal(again.current_std, first.current_std, err_msg=mode)
+
+
+def test_rows_that_draw_more_are_corrected_by_more() -> None:
+    """Of a difference d of A and B, A has d (0.84 + 0.25 row_share), and B lacks the remainder.
+
+    Cells of the first row, and those of the first column, conduct. So what the other cells of one
+    draw comes from the row alone, and those of the other from the column alone.
+    """
+    random = np.random.default_rng(11)
+    current = np.full((8, 8), 0.005)
+    current[0, 1:] = current[1:, 0] = 0.3
+    rest = np.mean([a_board(current, random) for _ in range(30)], axis=0)
+    reader = PortReader(knowledge(rest))
+    for _ in range(10):
+        reader.read(a_board(current, random), in_order=True)
+        reader.read(quick_of(a_board(current, random)), in_order=True)
+    by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
+    share = (by_row - by_column) / (by_row + by_column)
+    difference = 10.0 / 1024
+    excess = difference * (0.84 + 0.25 * share)
+    ratio = np.full((8, 8, 4), np.nan)
+    ratio[..., 0] = 1.0 - current - excess
+    ratio[..., 1] = current - (difference - excess)
+    found = reader.read(ratio, in_order=True)
+    off_by = 1024 * (3e4 * found.current - current)
+    # With the same share everywhere, they would be off by 2.5 LSB times row_share.
+    assert share[0, 1:].min() > 0.9
+    assert share[1:, 0].max() < -0.9
+    assert np.abs(off_by).max() < 0.5
+
+
+def test_an_offset_that_no_board_has_is_not_taken_from_one_reading() -> None:
+    """By 12 LSB, alike in all cells: only the part is believed that a converter may have."""
+    random = np.random.default_rng(12)
+    rest, touched = pressed(random)
+    reader = PortReader(knowledge(a_board(rest, random)))
+    for _ in range(5):
+        reader.read(a_board(touched, random, offset_lsb=(12.0, 12.0)), in_order=True)
+        found = reader.read(quick_of(a_board(touched, random)), in_order=True)
+    off_by = 1024 * (3e4 * found.current - touched)
+    assert np.median(off_by) == pytest.approx(-1024 * MOST_OFFSET_RATIO, abs=0.7)
+
+
+def test_a_line_that_hangs_teaches_nothing_of_the_board() -> None:
+    """Its node reads 0.9 at either supply: its readings are off by most of the supply, one way."""
+    random = np.random.default_rng(13)
+    rest, touched = pressed(random)
+    reader = PortReader(knowledge(a_board(rest, random)))
+    errors = []
+    for number in range(40):
+        frame = a_board(touched, random, bow_lsb=2.0)
+        if number >= 10:
+            frame[5, :, 0] = frame[5, :, 3] = 0.9
+        reader.read(frame, in_order=True)
+        found = reader.read(quick_of(a_board(touched, random, bow_lsb=2.0)), in_order=True)
+        if number >= 10:
+            errors.append((3e4 * found.current - touched) / (3e4 * found.current_std))
+    assert abs(np.mean(errors)) < 0.2
+    assert abs(np.mean(np.array(errors)[:, 2:4, 2:4])) < 0.4
+    assert 0.85 < np.std(errors) < 1.2
+
+
+def test_a_rest_that_is_a_mean_teaches_no_noise() -> None:
+    """A frame of one reading is asked for before the first whole one: rest stands in until then."""
+    random = np.random.default_rng(14)
+    rest, touched = pressed(random)
+    reader = PortReader(knowledge(np.mean([a_board(rest, random) for _ in range(50)], axis=0)))
+    reader.read(quick_of(a_board(touched, random)), in_order=True)
+    errors = []
+    for _ in range(3):
+        reader.read(a_board(touched, random), in_order=True)
+        found = reader.read(quick_of(a_board(touched, random)), in_order=True)
+        errors.append((3e4 * found.current - touched) / (3e4 * found.current_std))
+    assert 0.85 < np.std(errors) < 1.15
+
+
+def test_a_reader_of_one_cell_that_was_reset_answers_as_a_fresh_one() -> None:
+    """Noise of one cell is by what changes from frame to frame: not from before to after."""
+    random, current = np.random.default_rng(15), np.full((1, 1), 0.2)
+    used, fresh = (PortReader(SkinKnowledge(1, 1, adc_bits=10)) for _ in range(2))
+    quick = np.array([np.nan, 0.2, np.nan, np.nan])[None, None]
+    for _ in range(3):
+        used.read(a_board(current, random, offset_lsb=(5.0, -5.0)), in_order=True)
+        used.read(quick, in_order=True)
+    used.reset()
+    for _ in range(3):
+        frame = a_board(current, random)
+        for ratio in (frame, quick):
+            again, first = (reader.read(ratio, in_order=True) for reader in (used, fresh))
+            np.testing.assert_array_equal(again.current, first.current)
+            np.testing.assert_array_equal(again.current_std, first.current_std)
