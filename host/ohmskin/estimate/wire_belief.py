@@ -482,9 +482,10 @@ class WireBelief(ABC):
     def parts_of_level(
         self, log_std: Float, wires_log_std: Float, leads_log_std: Float
     ) -> tuple[Float, Float, Float]:
-        """The same without what wires were told wrongly by: a level has no error of that.
+        """The deviation of a level, and the parts of it that come from wires and from the lead.
 
-        log_std, wires_log_std, leads_log_std: as `prior.siemens_std` takes them, (RC,).
+        It is that of the cell, without what wires were told wrongly by. Arguments and results are
+        as `prior.siemens_std` takes them, (RC,).
         """
         share = self.told.told_share
         gone = share * (wires_log_std**2 + leads_log_std**2)
