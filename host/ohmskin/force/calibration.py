@@ -72,6 +72,8 @@ MAX_FILE_BYTES: Final = 4_000_000
 # No number of a file is larger. Chosen: it is far beyond any force, time or conductance in any
 # unit, and beyond the slope of any power law in siemens; yet sums of its square do not overflow.
 MAX_NUMBER: Final = 1e60
+# What a touch may be in place of what the curve gives, in deviations: none is further off.
+_OPEN_STDS: Final = np.linspace(-4.0, 4.0, 41)
 # There are so many unit ids: the link has an integer of a fixed size for them.
 UNIT_IDS: Final = FRAMES["hello"].span("unit_id")
 # The fields of the file, by where a `Calibration` keeps their values: in itself, with their types;
@@ -234,23 +236,28 @@ class Calibration:
 
         rise, rise_std: above rest, (..., R, C) [S; 1 for `voltage`]; touched: which cells are.
 
-        They are `model.predict`, F with deviation s. But behind wires that resist much more than a
-        cell, readings may allow any hard touch. So where s of a touched cell is above the largest
-        force L of the presses, its deviation is L. And if F is above L, it is the mean of F and a
-        normal about L that is only so narrow that this deviation is left,
+        They are `model.predict`, F with deviation s. But where s is large, readings may allow any
+        hard touch. So where s of a touched cell is above the largest force L of the presses, it is
+        L. And any force q is as probable as others up to L, and above L by (L / q)^2: twice as hard
+        as ever pressed is a quarter as probable. Where the mean of what this leaves,
 
-            L + (L / s)^2 (F - L) .
+            p(q) ~ exp(-(q - F)^2 / (2 s^2)) min(1, (L / q)^2) ,   q > 0 ,
+
+        is below F, that mean and its deviation take the place of F and s. (Nowhere is it taken if
+        it is higher: s is the larger one of two sides, and up to less force it counts too much.)
 
         Raises ValueError as `predict` does.
         """
         force_n, std_n = self.model.predict(rise, rise_std)
         largest_n = self.largest_force_n
-        if largest_n is None or not (is_open := touched & (std_n > largest_n)).any():
+        if largest_n is None:
             return force_n, std_n
-        share = (largest_n / np.maximum(std_n, largest_n)) ** 2
-        drawn_n = largest_n + share * (force_n - largest_n)
-        is_above = is_open & (force_n > largest_n)
-        return np.where(is_above, drawn_n, force_n), np.where(is_open, largest_n, std_n)
+        std_n = np.where(touched & (std_n > largest_n), largest_n, std_n)
+        may_be_above = touched & (force_n + _OPEN_STDS[-1] * std_n > largest_n)
+        if may_be_above.any():
+            uncertain = force_n[may_be_above], std_n[may_be_above]
+            force_n[may_be_above], std_n[may_be_above] = _likely(*uncertain, largest_n)
+        return force_n, std_n
 
     def save(self, path: PathName) -> None:
         """Write the file whole or not at all. Raises ValueError if it cannot be written."""
@@ -270,6 +277,18 @@ class Calibration:
         text = json.dumps(content, allow_nan=False, default=np.ndarray.tolist)
         with whole_file(path) as file:
             file.write(text.encode())
+
+
+def _likely(force_n: Float, std_n: Float, largest_n: float) -> tuple[Float, Float]:
+    """`Calibration.forces` of n touched cells, each (n,), by a sum over q."""
+    q = force_n[:, None] + std_n[:, None] * _OPEN_STDS
+    prior = (q > 0) * np.minimum(largest_n / np.maximum(q, largest_n), 1.0) ** 2
+    share = prior * np.exp(-0.5 * _OPEN_STDS**2)
+    share /= share.sum(axis=1, keepdims=True)
+    mean_n = (share * q).sum(axis=1)
+    spread_n = np.sqrt((share * (q - mean_n[:, None]) ** 2).sum(axis=1))
+    is_lower = mean_n < force_n
+    return np.where(is_lower, mean_n, force_n), np.where(is_lower, spread_n, std_n)
 
 
 def _null(array: Float) -> NDArray[Any]:
