@@ -261,6 +261,14 @@ def test_force_is_never_negative_and_keeps_its_standard_deviation() -> None:
     assert np.isnan(std[0, 0])
 
 
+def test_an_error_upwards_is_no_error_downwards() -> None:
+    """Behind long wires, a conductance may be twice as large, but no touch is perhaps none."""
+    x = np.linspace(20e-6, 200e-6, 12)
+    found = ForceRegression().fit(np.zeros(12, int), x, 800 * x**0.65, shape=(1, 1))
+    (force,), (std,) = found.model_.predict([[100e-6]], [[100e-6]])
+    assert std[0] == pytest.approx(force[0] * (2**0.65 - 1), rel=1e-3)
+
+
 def test_steep_laws_stay_finite_at_rest() -> None:
     found = fit_one(*presses(60, 17, 0.4))
     _, std = found.model_.predict([[0.0]], [[1e-6]])

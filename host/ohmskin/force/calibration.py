@@ -243,8 +243,9 @@ class Calibration:
 
             p(q) ~ exp(-(q - F)^2 / (2 s^2)) min(1, (L / q)^2) ,   q > 0 ,
 
-        is below F, that mean and its deviation take the place of F and s. (Nowhere is it taken if
-        it is higher: s is the larger one of two sides, and up to less force it counts too much.)
+        is below F, it takes the place of F. (Not where it is higher: s is that of errors upwards,
+        and there may be less of them downwards.) The deviation is that of all q about the force
+        that is given.
 
         Raises ValueError as `predict` does.
         """
@@ -285,10 +286,8 @@ def _likely(force_n: Float, std_n: Float, largest_n: float) -> tuple[Float, Floa
     prior = (q > 0) * np.minimum(largest_n / np.maximum(q, largest_n), 1.0) ** 2
     share = prior * np.exp(-0.5 * _OPEN_STDS**2)
     share /= share.sum(axis=1, keepdims=True)
-    mean_n = (share * q).sum(axis=1)
-    spread_n = np.sqrt((share * (q - mean_n[:, None]) ** 2).sum(axis=1))
-    is_lower = mean_n < force_n
-    return np.where(is_lower, mean_n, force_n), np.where(is_lower, spread_n, std_n)
+    likely_n = np.minimum((share * q).sum(axis=1), force_n)
+    return likely_n, np.sqrt((share * (q - likely_n[:, None]) ** 2).sum(axis=1))
 
 
 def _null(array: Float) -> NDArray[Any]:

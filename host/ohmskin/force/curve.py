@@ -21,9 +21,10 @@ dx     (R, C)  standard deviation of x                                          
 
 Standard deviation of a force, with J the derivatives of F by the cell's free coefficients:
 
-    F_std^2 = d^2 + s0^2 + (s1 F)^2 + J K J^T ,     d = max(F(x + dx) - F(x), F(x) - F(x - dx)) .
+    F_std^2 = d^2 + s0^2 + (s1 F)^2 + J K J^T ,     d = F(x + dx) - F(x) .
 
-For x^b with b < 1 the differential is infinite at rest, the difference is not.
+For x^b with b < 1 the differential is infinite at rest, the difference is not. Where errors of a
+conductance are not alike in both directions, dx is that upwards: so is d.
 """
 
 from dataclasses import dataclass, fields
@@ -168,8 +169,8 @@ def force_by(curve: ForceModel | Curve, x: Float) -> Float:
 
 def spread(curve: ForceModel | Curve, x: Float, dx: Float) -> tuple[Float, Float]:
     """`force_by`, and d of the module's equations [N]: how far F is off if x is off by dx."""
-    here, more, less = force_by(curve, np.array([x, x + dx, x - dx]))
-    return here, np.maximum(more - here, here - less)
+    here, more = force_by(curve, np.array([x, x + dx]))
+    return here, more - here
 
 
 def require(name: str, good: Bool, what: str) -> None:
