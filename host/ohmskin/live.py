@@ -101,6 +101,10 @@ class LiveSkin(Closing):
     def status(self) -> str:
         """That scans come, or why there are none, in words."""
         said = "gives scans" if self._count else "is being opened"
+        if self.skipped and not self._count:
+            said = "gives scans, all of them too late: end other programs, or ask for a lower rate"
+        if self.closing.is_set():
+            said = "was closed"
         return str(self.failure or f"{self.port} {said}")
 
     def newest(self) -> ForceScan | None:

@@ -136,6 +136,24 @@ def test_a_machine_that_is_too_slow_passes_scans_over(monkeypatch: pytest.Monkey
             skin.since(0, 0.01)
             assert not isinstance(skin.failure, OhmskinError)
         assert skin.newest() is None
+        # It said that the port is being opened.
+        assert "gives scans, all of them too late: " in skin.status
+
+
+def test_a_closed_skin_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It said that it gives scans."""
+    read = SkinReader.read
+
+    def slowly(reader: SkinReader, scan: Scan) -> ohmskin.ForceScan:
+        skin.closing.wait(ENOUGH_S if skin.newest() else 0.0)
+        return read(reader, scan)
+
+    with LiveSkin(URL, of_scene("ghost")) as skin:
+        monkeypatch.setattr(SkinReader, "read", slowly)
+        until(lambda: skin.newest() is not None)
+        time.sleep(0.1)  # scans wait for the thread, which then finds no failure
+    assert skin.ended
+    assert skin.status == f"{skin.port} was closed"
 
 
 def test_what_only_shows_a_skin_gets_the_newest_scan(monkeypatch: pytest.MonkeyPatch) -> None:
