@@ -163,10 +163,11 @@ class Device(Closing):
 
         :raises DeviceLost: the board went away, or said nothing for `SILENCE_TIMEOUT_S`.
         """
-        self.start()
         queue: deque[Scan] = deque()
-        with self._changed:
+        with self._changed:  # before the start: on a busy machine, scans may come before it returns
             self._queues[id(queue)] = queue
+        self.start()
+        with self._changed:
             self._asked = True
             self._changed.notify_all()
         return self._taken(queue)
