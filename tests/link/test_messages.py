@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Board messages from bytes, and what is counted between them: gaps, wraps, restarts, strangers."""
 
+import copy
+import pickle
 from dataclasses import fields
 from typing import Any
 
@@ -184,3 +186,15 @@ def test_a_message_has_the_fields_of_its_frame(message: type[Any], name: str) ->
 def test_values_of_a_newer_definition_have_a_name() -> None:
     octets = framing.encode(protocol.FRAMES["ack"].id, 0, bytes([0x83, 7, 200, *bytes(8)]))
     assert BoardDecoder().feed(octets, 0.0) == [Ack(0x83, 7, "unknown_200", 0, 0)]
+
+
+@pytest.mark.parametrize("name", ["contacts", "estimate", "force_n", "wrench"])
+def test_a_scan_without_forces_says_how_to_get_them(name: str) -> None:
+    """Its AttributeError said only that there are none."""
+    (scan,) = scans(BoardDecoder(), scan_wire(1))
+    with pytest.raises(AttributeError, match=rf"'{name}': .* calibration is given: ohmskin\.open"):
+        getattr(scan, name)
+    with pytest.raises(AttributeError, match=r"^'Scan' object has no attribute 'contact'$"):
+        scan.contact  # type: ignore[attr-defined]  # noqa: B018
+    assert not hasattr(scan, name)
+    assert repr(copy.deepcopy(pickle.loads(pickle.dumps(scan)))) == repr(scan)

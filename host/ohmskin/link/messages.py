@@ -8,7 +8,7 @@ a board time that does not wrap.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,8 @@ _MAX_SCAN_S = 10
 _MAX_REF_OHM = 10_000_000
 # No sound board has longer names of itself. Chosen: three times as long as all causes of a reset.
 _MOST_LETTERS = 100
+# Attributes that scans of a calibrated skin alone have, and that people ask others for.
+_OF_FORCES: Final = ("contacts", "estimate", "force_n", "force_n_std", "geometry", "wrench")
 
 
 @dataclass(frozen=True)
@@ -222,6 +224,15 @@ class Scan:
     slot_cycles: int = field(default=0, kw_only=True)
     rest_ratio: NDArray[np.float64] | None = field(default=None, kw_only=True)
     board: Hello | None = field(default=None, kw_only=True)
+
+    if not TYPE_CHECKING:  # a type checker would take any name for an attribute
+
+        def __getattr__(self, name: str) -> Any:
+            text = f"'{type(self).__name__}' object has no attribute '{name}'"
+            if name in _OF_FORCES:
+                text += ": scans have it where a calibration is given: "
+                text += "ohmskin.open(port, calibration='skin.json')"
+            raise AttributeError(text, name=name, obj=self)
 
     def __repr__(self) -> str:
         size = f"{self.rows}x{self.columns} cells, mode {self.mode}"
