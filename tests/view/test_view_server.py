@@ -192,6 +192,17 @@ def test_ctrl_c_ends_it_and_nothing_listens_beyond_loopback(command: Command) ->
     assert finish(process) == Done(0, "", "")
 
 
+def test_a_board_that_is_not_there_is_told_of_in_the_terminal(command: Command) -> None:
+    """The address came, and nothing else, for ever."""
+    process = command("view", "/dev/nothing", "--http-port", "0", "--no-browser")
+    said = process.stderr.readline()
+    assert process.stdout.readline().startswith("http://127.0.0.1:")
+    process.send_signal(signal.SIGINT)
+    done = finish(process)
+    text = "ohmskin: no port /dev/nothing: 'ohmskin ports' lists the ports there are\n"
+    assert (said, done) == (text, Done(0, "", ""))
+
+
 def test_ctrl_c_counts_from_the_moment_the_address_is_known() -> None:
     """Python's own handler would end the server while it starts, with a warning on stderr."""
     handlers = []

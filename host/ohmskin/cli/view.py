@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin view``: a live page of one or several boards."""
 
+import logging
 import os
 import sys
 import threading
@@ -10,9 +11,11 @@ from typing import Annotated, Final
 
 from typer import Argument, Option
 
+from ohmskin.cli.terminal import printable
 from ohmskin.ctrl_c import ends_by_ctrl_c
 from ohmskin.errors import OhmskinError
 from ohmskin.force.calibration import load_calibration
+from ohmskin.link.device import LOG
 
 # Where Linux says that a browser has somewhere to open.
 _DISPLAYS: Final = {"DISPLAY", "WAYLAND_DISPLAY"}
@@ -37,6 +40,7 @@ def view(
     """Show skins live on a page in the browser: heat map, contacts, tare, recording.
 
     Only this machine reaches it, unless --host says otherwise, at the address that is printed.
+    A board that is not there, or goes, is told of, and is opened whenever it is plugged in.
     Recordings go to the current folder. Ctrl-C ends it; a recording is whole then.
     """
     try:
@@ -57,7 +61,19 @@ def view(
             # Some browsers return only when they are closed.
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
-    with ends_by_ctrl_c():
-        server.serve(
-            ViewedBoards(ports or (), calibrations, Path(), force=force), host, http_port, started
-        )
+    LOG.addHandler(told := _Told())
+    try:
+        with ends_by_ctrl_c():
+            boards = ViewedBoards(ports or (), calibrations, Path(), force=force)
+            server.serve(boards, host, http_port, started)
+    finally:
+        LOG.removeHandler(told)
+
+
+class _Told(logging.Handler):
+    """Prints what the log says of boards: whoever looks at the terminal may not see the page."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """A line on stderr."""
+        text = " ".join(record.getMessage().split())
+        print(printable(f"ohmskin: {text}"), file=sys.stderr, flush=True)  # noqa: T201
