@@ -26,5 +26,8 @@ def main(port: str, seconds: float = float("inf")) -> None:
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit(__doc__)
-    with suppress(KeyboardInterrupt):  # Ctrl-C ends it
-        main(sys.argv[1])
+    try:
+        with suppress(KeyboardInterrupt):  # Ctrl-C ends it
+            main(sys.argv[1])
+    except (ohmskin.OhmskinError, ValueError) as exc:
+        sys.exit(f"estimate: {exc}")

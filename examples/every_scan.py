@@ -9,8 +9,11 @@ import ohmskin
 if len(sys.argv) < 2:
     sys.exit(__doc__)
 port, scans = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 0
-with suppress(KeyboardInterrupt), ohmskin.open(port) as skin:  # Ctrl-C ends it
-    for count, scan in enumerate(skin, start=1):
-        print(scan.number, scan.missed, scan.ratio[0, 0])
-        if count == scans:
-            break
+try:
+    with suppress(KeyboardInterrupt), ohmskin.open(port) as skin:  # Ctrl-C ends it
+        for count, scan in enumerate(skin, start=1):
+            print(scan.number, scan.missed, scan.ratio[0, 0])
+            if count == scans:
+                break
+except (ohmskin.OhmskinError, ValueError) as exc:
+    sys.exit(f"every_scan: {exc}")

@@ -19,7 +19,10 @@ import ohmskin
 if len(sys.argv) != 3:
     sys.exit(__doc__)
 port, calibration = sys.argv[1:]
-with suppress(KeyboardInterrupt), ohmskin.open(port, calibration=calibration) as skin:
-    for scan in skin:
-        for each in scan.contacts:
-            print(f"{each.force_text} at ({each.row:.1f}, {each.column:.1f})", flush=True)
+try:
+    with suppress(KeyboardInterrupt), ohmskin.open(port, calibration=calibration) as skin:
+        for scan in skin:
+            for each in scan.contacts:
+                print(f"{each.force_text} at ({each.row:.1f}, {each.column:.1f})", flush=True)
+except (ohmskin.OhmskinError, ValueError) as exc:
+    sys.exit(f"forces: {exc}")

@@ -48,5 +48,8 @@ def main(port: str, calibration: str, seconds: float = float("inf")) -> None:
 if __name__ == "__main__":
     if len(sys.argv) < 3:
         sys.exit(__doc__)
-    with suppress(KeyboardInterrupt):  # Ctrl-C ends it
-        main(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:]))
+    try:
+        with suppress(KeyboardInterrupt):  # Ctrl-C ends it
+            main(sys.argv[1], sys.argv[2], *map(float, sys.argv[3:]))
+    except (ohmskin.OhmskinError, ValueError) as exc:
+        sys.exit(f"lsl_outlet: {exc}")

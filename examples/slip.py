@@ -75,4 +75,7 @@ def main(port: str, calibration: str, picture: str = "") -> None:
 if __name__ == "__main__":
     if len(sys.argv) not in (3, 4):
         sys.exit(__doc__)
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except (ohmskin.OhmskinError, ValueError) as exc:
+        sys.exit(f"slip: {exc}")

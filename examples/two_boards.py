@@ -15,10 +15,13 @@ from contextlib import suppress
 
 import ohmskin
 
-with suppress(KeyboardInterrupt), ohmskin.open_all(sys.argv[1:] or None) as skins:
-    print(f"units {', '.join(map(str, skins))}", flush=True)
-    for unit_id, scan in skins.scans():
-        at = f"{1e-9 * scan.time_ns:.4f} s: unit {unit_id}"
-        text = f"{at}, scan {scan.number}, missed {scan.missed}, "
-        b = scan.ratio[0, 0, scan.reading_names.index("b")]
-        print(f"{text}{b:.3f}", flush=True)
+try:
+    with suppress(KeyboardInterrupt), ohmskin.open_all(sys.argv[1:] or None) as skins:
+        print(f"units {', '.join(map(str, skins))}", flush=True)
+        for unit_id, scan in skins.scans():
+            at = f"{1e-9 * scan.time_ns:.4f} s: unit {unit_id}"
+            text = f"{at}, scan {scan.number}, missed {scan.missed}, "
+            b = scan.ratio[0, 0, scan.reading_names.index("b")]
+            print(f"{text}{b:.3f}", flush=True)
+except (ohmskin.OhmskinError, ValueError) as exc:
+    sys.exit(f"two_boards: {exc}")

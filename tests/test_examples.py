@@ -259,6 +259,15 @@ def test_an_example_without_arguments_says_how_to_call_it(name: str) -> None:
     assert "Traceback" not in done.err
 
 
+@pytest.mark.parametrize("name", ["every_scan", "estimate", "forces", "slip", "two_boards"])
+def test_a_wrong_port_is_one_line(name: str, skin_json: str) -> None:
+    """It was a traceback."""
+    calibration = [skin_json] if name in ("forces", "slip") else []
+    done = python(str(EXAMPLES / f"{name}.py"), "/dev/nothing", *calibration)
+    line = f"{name}: no port /dev/nothing: 'ohmskin ports' lists the ports there are\n"
+    assert done == (1, "", line)
+
+
 def test_every_example_is_run_here() -> None:
     tested = {
         *("every_scan.py", "estimate.py", "forces.py", "two_boards.py"),

@@ -62,4 +62,7 @@ def main(calibration: str, picture: str = "") -> None:
 if __name__ == "__main__":
     if len(sys.argv) not in (2, 3):
         sys.exit(__doc__)
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except ValueError as exc:
+        sys.exit(f"squeeze: {exc}")

@@ -123,3 +123,8 @@ def test_what_is_missing_is_said(skin_json: str) -> None:
         Pad(model, "hand", known)
     with pytest.raises(ValueError, match="ohmskin skin FILE --pitch-mm"):
         Pad(model, "skin", replace(known, geometry=None))
+    done = subprocess.run(
+        [sys.executable, HERE / "squeeze.py", "no.json"], capture_output=True, text=True
+    )
+    line = "squeeze: no.json: cannot be read: No such file or directory\n"  # it was a traceback
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", line)
