@@ -16,7 +16,8 @@ from calibrations import of_scene
 from command_line import Run, assert_one_line, well
 from ohmskin.errors import OhmskinError, RecordingError
 from ohmskin.force.reader import ForceScan
-from ohmskin.force.tables import export, load_forces
+from ohmskin.force.tables import export, load_forces, read_forces
+from ohmskin.record.export import Part
 from ohmskin.record.readings import load_readings
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Mark
@@ -135,6 +136,24 @@ def test_another_unit_in_a_recording_needs_its_own_calibration(tmp_path: Path) -
     assert len(load_forces(path, of_other, begin_s=0.5)["number"]) == 10
     with pytest.raises(ValueError, match="of unit 0, the board is unit 5"):
         load_forces(path, of_scene("ghost"), begin_s=0.5)
+
+
+def test_scans_before_an_error_are_given_and_the_error_says_where(tmp_path: Path, run: Run) -> None:
+    """Those of its group were not; and it named neither the recording nor the moment."""
+    path, skin = tmp_path / "a.mcap", stepped(URL)
+    with Recorder(path, skin.info) as recorder:
+        for scan in islice(skin, 100):
+            recorder.add(scan)
+        skin.configure(mode="far")
+        recorder.add(skin.info)
+        recorder.add(skin.latest())
+    forces, found = read_forces(Part(path), of_scene("ghost")), []
+    with pytest.raises(RecordingError, match=r"a\.mcap: after 1\.1.* s, .* near, now in far: exp"):
+        found += forces
+    assert [scan.number for scan in found] == list(range(100))
+    of_scene("ghost", unit_id=5).save(tmp_path / "skin.json")
+    words = ("export", str(path), str(tmp_path / "a.npz"), "--calibration")
+    assert_one_line(run(*words, str(tmp_path / "skin.json")), "a.mcap: this calibration is of unit")
 
 
 def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: Run) -> None:

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.errors import OhmskinError
-from ohmskin.files import PathName, save_table, whole_file
+from ohmskin.files import PathName, naming, save_table, whole_file
 from ohmskin.force.calibration import Calibration
 from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.messages import Scan
@@ -64,7 +64,7 @@ def load_forces(
 
     end_s = 0: to the last scan. An hour of 8x8 at 90 Hz takes 200 MB; `export` needs less memory.
 
-    :raises RecordingError: the recording cannot be read, or the part has scans of another unit.
+    :raises RecordingError: the recording cannot be read; the part has scans of two units or modes.
     :raises ValueError: the calibration is of another unit, size or mode.
     """
     part = Part(path, begin_s, end_s, timed=True)
@@ -113,11 +113,34 @@ def export(
 
 
 def read_forces(part: Part, calibration: Calibration) -> Iterator[ForceScan]:
-    """The scans of a part of a recording with their forces, each with the tare before it."""
-    scans, reader = _tared(part), None
-    while group := list(islice(scans, _READ_SCANS)):
-        reader = reader or SkinReader(part.boards[0], calibration)
-        yield from reader.read_all(group)
+    """The scans of a part of a recording with their forces, each with the tare before it.
+
+    Before an error comes, all scans before it are given.
+
+    :raises RecordingError: as `load_forces`.
+    :raises ValueError: as `load_forces`.
+    """
+    scans, reader, failure = _tared(part), None, None
+    while failure is None:
+        group: list[Scan] = []
+        try:
+            for scan in islice(scans, _READ_SCANS):
+                if reader is None:
+                    with naming(part.path):
+                        reader = SkinReader(part.boards[0], calibration)
+                try:
+                    reader.check_mode(scan.mode)
+                except ValueError as exc:
+                    remedy = "export each part by its own calibration"
+                    raise part.error(f"after {part.after_s:.3f} s, {exc}: {remedy}") from exc
+                group.append(scan)
+        except OhmskinError as exc:
+            failure = exc
+        if reader is not None and group:
+            yield from reader.read_all(group)
+        elif failure is None:
+            return
+    raise failure
 
 
 def _tared(part: Part) -> Iterator[Scan]:

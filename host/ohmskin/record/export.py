@@ -81,6 +81,7 @@ class Part:
 
     begin_s, end_s: the part's first and last moment [s after the first scan]; 0: of the recording.
     scans: how many scans there were.
+    after_s: when the newest of them was [s after the first scan of the recording].
     cut_off: whether the recording was not ended properly, so that its last second may be missing.
     boards: what the board had said of itself at the part's first scan, and then at each scan before
         which it said something new.
@@ -95,6 +96,7 @@ class Part:
     begin_s: float = 0.0
     end_s: float = 0.0
     scans: int = 0
+    after_s: float = 0.0
     cut_off: bool = True
     boards: list[Hello] = field(default_factory=list)
     tares: list[Tare] = field(default_factory=list)
@@ -126,7 +128,7 @@ class Part:
                         raise self.error(f"{change}: export each part by itself")
                     if self.boards[-1:] != [board]:
                         self.boards.append(board)
-                    self.scans += 1
+                    self.scans, self.after_s = self.scans + 1, after_s
                     yield message
         if not self.scans:
             raise RecordingError(f"{self.path}: no scans, neither in it nor in this part of it")
