@@ -476,7 +476,7 @@ TAKES = {
     "estimate": "READINGS --method --out --cold --ref-std",
     "record": "PORT FILE --scans --seconds --tare --mark --force-port --force-baud --force-scale"
     " --force-unit --force-column",
-    "export": "RECORDING OUT --begin --end --calibration --format --backend",
+    "export": "RECORDING OUT --begin --end --calibration --force --format --backend",
     "emulate": "URL --seconds",
     "demo": "--seconds --port --picture",
     "calibrate": "knead recording scale table weights",

@@ -156,6 +156,23 @@ def test_scans_before_an_error_are_given_and_the_error_says_where(tmp_path: Path
     assert_one_line(run(*words, str(tmp_path / "skin.json")), "a.mcap: this calibration is of unit")
 
 
+def test_a_calibration_of_another_unit_can_be_taken(
+    recorded: Path, tmp_path: Path, run: Run
+) -> None:
+    """As `stream` and `view` take it, for a board that was changed: `export` had no such option."""
+    pytest.importorskip("joblib")
+    of_scene("ghost", unit_id=5).save(tmp_path / "skin.json")
+    again = tmp_path / "b.mcap"
+    again.write_bytes(recorded.read_bytes())
+    force = ("--calibration", str(tmp_path / "skin.json"), "--force", "--backend", "threading")
+    well(run("export", str(recorded), str(tmp_path / "a.csv"), *force))
+    well(run("export", str(recorded), str(again), str(tmp_path), *force))
+    expected = load_forces(recorded, of_scene("ghost"))["force_n"]
+    for name in ("a.npz", "b.npz"):
+        with np.load(tmp_path / name) as file:
+            np.testing.assert_array_equal(file["force_n"], expected)
+
+
 def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: Run) -> None:
     pytest.importorskip("joblib")
     of_scene("ghost").save(tmp_path / "skin.json")

@@ -243,6 +243,7 @@ def export(
     ] = 0.0,
     end_s: Annotated[float, Option("--end", min=0, help="until then, in s; 0: to the last")] = 0.0,
     calibration: Annotated[Path | None, Option(help="forces in place of readings")] = None,
+    force: Annotated[bool, Option("--force", help="take that of another unit")] = False,
     kind: Annotated[str, Option("--format", help="of the files in a folder; default: .npz")] = "",
     backend: Annotated[str, Option(help="joblib's, where a folder is written: dask")] = "loky",
 ) -> None:
@@ -267,9 +268,9 @@ def export(
             def watch(size: int) -> None:
                 bar.update(task, completed=size)
 
-            done = [tables.export(*pairs[0], known, begin_s, end_s, watch)]
+            done = [tables.export(*pairs[0], known, begin_s, end_s, watch, force=force)]
     else:
-        done = _at_once(pairs, backend, known, begin_s, end_s)
+        done = _at_once(pairs, backend, known, begin_s, end_s, force=force)
     for (path, to), written in zip(pairs, done, strict=True):
         TERMINAL.print(f"{to}: {written.scans} scans")
         if written.cut_off:
@@ -277,7 +278,7 @@ def export(
             _errors.print(text, soft_wrap=True, highlight=False)
 
 
-def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any) -> list[Part]:
+def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any, force: bool) -> list[Part]:
     """Each of these recordings to its file, by all cores, or by a cluster that joblib knows."""
     try:
         import joblib
@@ -289,7 +290,7 @@ def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any) -> list[P
                 # That of the lab, which dask's own configuration names; else one of this machine.
                 stack.enter_context(Client(dashboard_address=None))
             stack.enter_context(joblib.parallel_config(backend))
-            jobs = (joblib.delayed(tables.export)(*pair, *told) for pair in pairs)
+            jobs = (joblib.delayed(tables.export)(*pair, *told, force=force) for pair in pairs)
             done = joblib.Parallel(n_jobs=-1, return_as="generator")(jobs)
             bar = stack.enter_context(_bar())
             return list(bar.track(done, total=len(pairs), description="recordings"))

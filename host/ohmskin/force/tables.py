@@ -58,17 +58,23 @@ _GROUP_SCANS: Final = 2048
 
 
 def load_forces(
-    path: PathName, calibration: Calibration, begin_s: float = 0.0, end_s: float = 0.0
+    path: PathName,
+    calibration: Calibration,
+    begin_s: float = 0.0,
+    end_s: float = 0.0,
+    *,
+    force: bool = False,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of the module's table, of the scans from `begin_s` to `end_s` [s after the first].
 
     end_s = 0: to the last scan. An hour of 8x8 at 90 Hz takes 200 MB; `export` needs less memory.
+    force: take the calibration even if it is of another unit.
 
     :raises RecordingError: the recording cannot be read; the part has scans of two units or modes.
     :raises ValueError: the calibration is of another unit, size or mode.
     """
     part = Part(path, begin_s, end_s, timed=True)
-    groups = list(_groups(part, calibration))
+    groups = list(_groups(part, calibration, force=force))
     # Each group gives up its share of an array, so that no more than one array is there twice.
     return {
         name: np.concatenate([group.pop(name) for group in groups]) for name in list(groups[0])
@@ -82,11 +88,14 @@ def export(
     begin_s: float = 0.0,
     end_s: float = 0.0,
     watch: Callable[[int], object] | None = None,
+    *,
+    force: bool = False,
 ) -> Part:
     """Write what `load_forces` gives to `out`, complete or not at all: one of `FORMATS`.
 
     calibration: None: readings are written (`ohmskin.record.export`), as .npz or .csv.
     watch: is told how many bytes of the recording were read.
+    force: take the calibration even if it is of another unit.
 
     Returns what was written.
 
@@ -101,19 +110,23 @@ def export(
     if calibration is None:
         save_readings(part, out)
     elif out.suffix == ".csv":
-        _save_csv(part, calibration, out)
+        _save_csv(read_forces(part, calibration, force=force), calibration, out)
     elif out.suffix == ".parquet":
-        _save_parquet(part, calibration, out)
+        _save_parquet(part, calibration, out, force=force)
     else:
         with whole_file(out) as file, Stacks(out.parent) as stacks:
-            for arrays in _groups(part, calibration):
+            for arrays in _groups(part, calibration, force=force):
                 stacks.add(arrays)
             stacks.save(file, _marks(part))
     return part
 
 
-def read_forces(part: Part, calibration: Calibration) -> Iterator[ForceScan]:
+def read_forces(
+    part: Part, calibration: Calibration, *, force: bool = False
+) -> Iterator[ForceScan]:
     """The scans of a part of a recording with their forces, each with the tare before it.
+
+    force: take the calibration even if it is of another unit.
 
     Before an error comes, all scans before it are given.
 
@@ -127,7 +140,7 @@ def read_forces(part: Part, calibration: Calibration) -> Iterator[ForceScan]:
             for scan in islice(scans, _READ_SCANS):
                 if reader is None:
                     with naming(part.path):
-                        reader = SkinReader(part.boards[0], calibration)
+                        reader = SkinReader(part.boards[0], calibration, force=force)
                 try:
                     reader.check_mode(scan.mode)
                 except ValueError as exc:
@@ -155,10 +168,10 @@ def _tared(part: Part) -> Iterator[Scan]:
 
 
 def _groups(
-    part: Part, calibration: Calibration, scans: int = _READ_SCANS
+    part: Part, calibration: Calibration, scans: int = _READ_SCANS, *, force: bool
 ) -> Iterator[dict[str, NDArray[Any]]]:
     """The arrays of `load_forces`, without the marks, of each so many scans."""
-    all_scans, begin = read_forces(part, calibration), 0
+    all_scans, begin = read_forces(part, calibration, force=force), 0
     while group := list(islice(all_scans, scans)):
         contacts = [contact for scan in group for contact in scan.contacts]
         counts = [len(scan.contacts) for scan in group]
@@ -181,18 +194,18 @@ def _marks(part: Part) -> dict[str, NDArray[Any]]:
     }
 
 
-def _save_csv(part: Part, calibration: Calibration, out: Path) -> None:
+def _save_csv(scans: Iterator[ForceScan], calibration: Calibration, out: Path) -> None:
     cells = list(np.ndindex(calibration.rows, calibration.columns))
     names = [f"r{row}c{column}_{name}" for name in _OF_CELLS for row, column in cells]
     of_scan = attrgetter(*_OF_SCAN)
     rows = (
         [*of_scan(scan), *scan.force_n.ravel().tolist(), *scan.force_n_std.ravel().tolist()]
-        for scan in read_forces(part, calibration)
+        for scan in scans
     )
     save_table(out, [*_OF_SCAN, *names], rows)
 
 
-def _save_parquet(part: Part, calibration: Calibration, out: Path) -> None:
+def _save_parquet(part: Part, calibration: Calibration, out: Path, *, force: bool) -> None:
     try:
         import pyarrow as pa
         from pyarrow.parquet import ParquetWriter
@@ -206,7 +219,7 @@ def _save_parquet(part: Part, calibration: Calibration, out: Path) -> None:
 
     with whole_file(out) as file, ExitStack() as stack:
         writer: Any = None  # its schema is that of the first group
-        for arrays in _groups(part, calibration, _GROUP_SCANS):
+        for arrays in _groups(part, calibration, _GROUP_SCANS, force=force):
             columns = {name: column(arrays[name]) for name in _OF_SCAN | _OF_CELLS}
             ends = begin + np.arange(1 + len(arrays["number"]))
             offsets = np.searchsorted(arrays["contact_scan"], ends).astype(np.int32)
