@@ -43,6 +43,24 @@ def test_touches_teach_single_segments_of_long_wires(monkeypatch: pytest.MonkeyP
     assert np.median(share) < 0.8 * np.median(without)
 
 
+def test_a_reset_forgets_single_segments() -> None:
+    """They stay among the means, but nothing is known of them, as before all frames."""
+    given = random_trial(8, 8, 8, 60, seed=1, wire_ohm=LONG).rounded(10)
+    knowledge = replace(given.knowledge(0), nominal_wire_ohm=NO_WIRES)
+    used, new = (make_estimator("joint", knowledge) for _ in range(2))
+    for ratio in given.ratio[:40]:
+        used.estimate(ratio)
+    learned, fresh = (estimator.estimate(given.ratio[40]) for estimator in (used, new))
+    used.reset()
+    again = used.estimate(given.ratio[40])
+
+    def stds_off(answer: Estimate) -> float:
+        off = np.abs(answer.cell_siemens - fresh.cell_siemens) / fresh.cell_siemens_std
+        return float(off.max())
+
+    assert stds_off(again) < 0.1 < stds_off(learned)
+
+
 def pressed(rest: Skin, cell: tuple[int, int]) -> Skin:
     """This skin with one cell pressed to 2 kOhm."""
     siemens = rest.cell_siemens.copy()

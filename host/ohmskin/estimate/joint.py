@@ -164,7 +164,11 @@ class JointEstimator(Estimator):
         return "known"
 
     def reset(self) -> None:
-        """Forget the frames before, and what they revealed of the wires."""
+        """Forget the frames before, and what they revealed of the wires.
+
+        Whether single segments are learned stays (`learn_segments`). So if frames have begun that,
+        answers may differ from those of a new estimator, by a small part of their deviations.
+        """
         super().reset()
         # (R, C) [S]: what `matrix` found in the last frame that it was asked about.
         self._cells_before: Float | None = None

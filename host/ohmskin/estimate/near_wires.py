@@ -112,7 +112,7 @@ class LearnedWires(WireBelief):
     """Wires at near ends: touches that share wires reveal the layers, a Kalman step a touch."""
 
     def reset(self) -> None:
-        """Back to the nominal wires."""
+        """Back to the nominal wires; single segments in m, too, are nominal ones again."""
         super().reset()
         self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
         known = _Filter(self._known.means, self._known.covariance)

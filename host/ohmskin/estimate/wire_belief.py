@@ -211,7 +211,11 @@ class WireBelief(ABC):
         self.reset()
 
     def learn_segments(self) -> None:
-        """From now on, learn what each segment's log differs from its layer's mean by."""
+        """From now on, learn what each segment's log differs from its layer's mean by.
+
+        It never ends, not even by `reset`: where nothing is known of single segments yet, answers
+        are nearly the same whether they are in m or noise of the same deviation.
+        """
         own = np.zeros(2 * self.leads_of_ports.shape[0])
         self._of_segments = slice(self._nominal.size, self._nominal.size + own.size)
         self._nominal = np.concatenate([self._nominal, own])
@@ -235,7 +239,11 @@ class WireBelief(ABC):
         return 0.0 if self.learns_segments else SEGMENT_STD
 
     def reset(self) -> None:
-        """Forget what frames have shown."""
+        """Forget what frames have shown.
+
+        Single segments that were in m stay there, as if nothing were known of them: see
+        `learn_segments`.
+        """
         self._lesson_cells: Float | None = None  # log resistances of the last lesson's frame
         self._believe(self._nominal, self._prior_covariance)
 
