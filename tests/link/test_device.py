@@ -405,6 +405,16 @@ def test_an_iterator_never_used_costs_nothing(monkeypatch: pytest.MonkeyPatch) -
         assert skin.stats.line.frames >= before.line.frames + 100  # `before` is a copy
 
 
+@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
+def test_a_mean_of_no_time_is_refused(seconds: float) -> None:
+    """That of NaN seconds went on for ever."""
+    with (
+        stepped("emulator://1x1?vanish=9") as skin,
+        pytest.raises(ValueError, match=rf"no mean of {seconds:g} seconds: say 0 or more"),
+    ):
+        skin.mean_ratio(seconds)
+
+
 def test_latest_waits_as_long_as_told() -> None:
     with stepped("emulator://1x1?rate=1") as skin:
         skin.start()

@@ -285,7 +285,8 @@ class SkinReader:
 
         :raises TareRefused: as `tare`.
         :raises DeviceLost: as `Device.mean_ratio`.
-        :raises ValueError: the board scans in another mode than was calibrated.
+        :raises ValueError: as `Device.mean_ratio`; the board scans in another mode than was
+            calibrated.
         """
         rest_ratio = device.mean_ratio(seconds)
         self.check_mode(device.info.mode)

@@ -213,7 +213,10 @@ class Device(Closing):
         """`mean_ratio` of the scans of the coming seconds.
 
         :raises DeviceLost: the board went away, or there are no more whole scans.
+        :raises ValueError: seconds are below 0, infinite or no number.
         """
+        if not 0 <= seconds < float("inf"):
+            raise ValueError(f"no mean of {seconds:g} seconds: say 0 or more, 0 for one scan")
         return mean_ratio(scans_for(self, seconds))
 
     def start(self) -> None:
