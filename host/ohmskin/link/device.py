@@ -199,8 +199,12 @@ class Device(Closing):
         return scan
 
     def _wait_for_scan(self, ready: Callable[[], bool], limit_s: float | None = None) -> None:
-        limit_s = SILENCE_TIMEOUT_S + 2 / self.info.rate_hz if limit_s is None else limit_s
+        patience_s = SILENCE_TIMEOUT_S + 2 / self.info.rate_hz
+        limit_s = patience_s if limit_s is None else limit_s
         if not self._wait(ready, limit_s):
+            if limit_s < patience_s:  # so short a silence is no sign of a board that is gone
+                text = f"{self.name} has sent no scan for {limit_s:.2g} s"
+                raise DeviceLost(text, "wait for longer: a larger timeout_s, or none")
             # A silent board has been asked for its hello. After a reset, it counts from 0 again.
             if (late := self.info.late) not in (0, self._late_before):
                 silent = f"{self.name} has sent no scan for {limit_s:.1f} s"
