@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 from ohmskin import opening
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.files import Closing
+from ohmskin.force.calibration import CalibrationLike, loaded
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
 from ohmskin.link.device import LOG, QUEUE_SCANS, SILENCE_TIMEOUT_S, Device, InThreads
 from ohmskin.link.messages import Hello, Scan
@@ -66,7 +67,7 @@ class LiveSkin(Closing):
     def __init__(
         self,
         port: str,
-        calibration: opening.CalibrationLike | None,
+        calibration: CalibrationLike | None,
         *,
         force: bool = False,
         every: bool = True,
@@ -85,7 +86,7 @@ class LiveSkin(Closing):
         """They are called when there is news, from the thread that reads: they must not wait."""
         self.closing = threading.Event()
         """Is set when `close` is called."""
-        self._calibration = None if calibration is None else opening.loaded(calibration)
+        self._calibration = None if calibration is None else loaded(calibration)
         self._force, self._every = force, every
         self._device: Device | None = None
         self._reader: SkinReader | None = None

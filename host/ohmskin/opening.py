@@ -23,14 +23,12 @@ from typing import overload
 
 from ohmskin.errors import PortError
 from ohmskin.files import PathName
-from ohmskin.force.calibration import Calibration, load_calibration
+from ohmskin.force.calibration import CalibrationLike, loaded
 from ohmskin.force.reader import CalibratedSkin
 from ohmskin.link.device import Device, Region
 from ohmskin.link.serial_port import SerialLink
 from ohmskin.link.session import Session
 from ohmskin.link.url import PortUrl
-
-CalibrationLike = Calibration | PathName
 
 
 @overload
@@ -91,11 +89,6 @@ def open(
             device.start()
         opened.pop_all()
         return skin
-
-
-def loaded(calibration: CalibrationLike) -> Calibration:
-    """The calibration itself, or that of the file. Raises ValueError as `load_calibration`."""
-    return calibration if isinstance(calibration, Calibration) else load_calibration(calibration)
 
 
 def _device(text: str) -> Device:

@@ -13,7 +13,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 from ohmskin import opening
 from ohmskin.errors import DeviceSilent, PortError
 from ohmskin.files import Closing, naming
-from ohmskin.force.calibration import Calibration
+from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
 from ohmskin.force.reader import CalibratedSkin, ForceScan
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -86,7 +86,7 @@ def open_all(urls: Iterable[str] | None = None, *, start: bool = True) -> Boards
 def open_all(
     urls: Iterable[str] | None = None,
     *,
-    calibrations: Iterable[opening.CalibrationLike],
+    calibrations: Iterable[CalibrationLike],
     start: bool = True,
 ) -> Boards[CalibratedSkin, ForceScan]: ...
 
@@ -94,7 +94,7 @@ def open_all(
 def open_all(
     urls: Iterable[str] | None = None,
     *,
-    calibrations: Iterable[opening.CalibrationLike] | None = None,
+    calibrations: Iterable[CalibrationLike] | None = None,
     start: bool = True,
 ) -> Any:
     """Connect to several boards, all of these or none, and start scanning unless told otherwise.
@@ -155,9 +155,9 @@ def _calibrated(device: Device, by_unit: dict[int, Calibration]) -> CalibratedSk
         return CalibratedSkin(device, by_unit[unit_id])
 
 
-def _by_unit(calibrations: Iterable[opening.CalibrationLike]) -> dict[int, Calibration]:
+def _by_unit(calibrations: Iterable[CalibrationLike]) -> dict[int, Calibration]:
     by_unit: dict[int, Calibration] = {}
-    for calibration in map(opening.loaded, calibrations):
+    for calibration in map(loaded, calibrations):
         if by_unit.setdefault(calibration.unit_id, calibration) is not calibration:
             raise ValueError(f"two calibrations are of unit {calibration.unit_id}: give one")
     return by_unit

@@ -106,6 +106,18 @@ def test_parquet_is_read_by_its_library(
     assert [mark["text"] for mark in json.loads(told[b"marks"])] == ["here", "end"]
 
 
+def test_a_calibration_may_be_a_file(recorded: Path, tmp_path: Path) -> None:
+    """As for `open`: it was an AttributeError that named no file."""
+    of_scene("ghost").save(path := tmp_path / "skin.json")
+    for name, array in load_forces(recorded, path).items():
+        np.testing.assert_array_equal(array, load_forces(recorded, of_scene("ghost"))[name])
+    force_n = np.eye(8)
+    of_file, same = (ohmskin.SimulatedSkin(of) for of in (str(path), of_scene("ghost")))
+    np.testing.assert_array_equal(
+        of_file.step(force_n, 0.1).force_n, same.step(force_n, 0.1).force_n
+    )
+
+
 def test_a_part_of_it(recorded: Path) -> None:
     arrays = load_forces(recorded, of_scene("ghost"), 0.1, 0.2)
     assert arrays["number"].tolist() == list(range(9, 18))

@@ -304,6 +304,14 @@ def _check_date(date: str) -> None:
         raise ValueError(f"date is {date[:40]!r}, not ISO 8601") from None
 
 
+CalibrationLike = Calibration | PathName
+
+
+def loaded(calibration: CalibrationLike) -> Calibration:
+    """The calibration itself, or that of the file. Raises ValueError as `load_calibration`."""
+    return calibration if isinstance(calibration, Calibration) else load_calibration(calibration)
+
+
 def load_calibration(path: PathName) -> Calibration:
     """Read and check a calibration file.
 

@@ -22,7 +22,7 @@ from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, LEAD_OHM, TOP_WIRE_OHM, Scen
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import METHODS
-from ohmskin.force.calibration import Calibration
+from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
 from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import BoardDecoder, Hello, Scan
@@ -36,21 +36,23 @@ _TARE_SCANS: Final = 90
 class SimulatedSkin:
     """The skin of a calibration, pressed by whatever forces a program says.
 
-    calibration: its curves, rest and wires are those of the skin; where it does not know the wires,
-        they are those of emulated skins.
+    calibration: a `Calibration` or the path of its file. Its curves, rest and wires are those of
+        the skin; where it does not know the wires, they are those of emulated skins.
     noise_lsb: standard deviation of the converter's noise, before rounding [LSB].
     seed: of the noise, and of the wires, which scatter by 10 % about what the calibration says.
 
-    >>> skin = SimulatedSkin(ohmskin.load_calibration("skin.json"))
+    >>> skin = SimulatedSkin("skin.json")
     >>> skin.step(force_n, time_s=0.01).force_n.shape
     (8, 8)
 
-    :raises ValueError: the calibration is of voltages, which say nothing of the cells.
+    :raises ValueError: the calibration cannot be read, or is of voltages, which say nothing of
+        the cells.
     """
 
     def __init__(
-        self, calibration: Calibration, *, noise_lsb: float = DEFAULT_NOISE_LSB, seed: int = 0
+        self, calibration: CalibrationLike, *, noise_lsb: float = DEFAULT_NOISE_LSB, seed: int = 0
     ) -> None:
+        calibration = loaded(calibration)
         if calibration.method not in METHODS:
             raise ValueError(
                 "a calibration by 'voltage' knows no conductances: take another method"

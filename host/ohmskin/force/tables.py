@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from ohmskin.errors import OhmskinError
 from ohmskin.files import PathName, naming, save_table, whole_file
-from ohmskin.force.calibration import Calibration
+from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
 from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.messages import Scan
 from ohmskin.record.export import FORMATS as OF_READINGS
@@ -59,7 +59,7 @@ _GROUP_SCANS: Final = 2048
 
 def load_forces(
     path: PathName,
-    calibration: Calibration,
+    calibration: CalibrationLike,
     begin_s: float = 0.0,
     end_s: float = 0.0,
     *,
@@ -67,14 +67,15 @@ def load_forces(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of the module's table, of the scans from `begin_s` to `end_s` [s after the first].
 
+    calibration: a `Calibration` or the path of its file.
     end_s = 0: to the last scan. An hour of 8x8 at 90 Hz takes 200 MB; `export` needs less memory.
     force: take the calibration even if it is of another unit.
 
     :raises RecordingError: the recording cannot be read; the part has scans of two units or modes.
-    :raises ValueError: the calibration is of another unit, size or mode.
+    :raises ValueError: the calibration cannot be read, or is of another unit, size or mode.
     """
     part = Part(path, begin_s, end_s, timed=True)
-    groups = list(_groups(part, calibration, force=force))
+    groups = list(_groups(part, loaded(calibration), force=force))
     # Each group gives up its share of an array, so that no more than one array is there twice.
     return {
         name: np.concatenate([group.pop(name) for group in groups]) for name in list(groups[0])
