@@ -111,6 +111,31 @@ def test_scans_of_another_mode_are_refused() -> None:
         reader.read(replace(next(scans), mode="far"))
 
 
+def test_scans_of_another_size_are_refused() -> None:
+    """The error named two shapes of ratios, and nothing to do."""
+    words = "board scanned 8x8 cells, now 3x8: configure it as before, or open it again"
+    with CalibratedSkin(stepped(GHOST), of_scene("ghost")) as skin:
+        assert len(skin.latest().contacts) == 3
+        skin.device.configure(rows=3)
+        with pytest.raises(ValueError, match=words):
+            skin.latest()
+        skin.device.configure(rows=8)
+        assert skin.latest().force_n.shape == (8, 8)
+
+
+def test_what_the_other_kind_of_skin_has_is_said_where_it_is_asked_for() -> None:
+    """Its AttributeError said only that there is none."""
+    device = stepped(GHOST)
+    with pytest.raises(AttributeError, match=r"'tare': .* calibration is given: ohmskin\.open"):
+        device.tare(1.0)  # type: ignore[attr-defined]
+    with CalibratedSkin(device, of_scene("ghost")) as skin:
+        with pytest.raises(AttributeError, match=r"'configure': .* has: skin\.device\.configure$"):
+            skin.configure(rows=3)  # type: ignore[attr-defined]
+        for of in (skin, device):
+            with pytest.raises(AttributeError, match=r"object has no attribute 'nothing'$"):
+                of.nothing  # type: ignore[attr-defined]  # noqa: B018
+
+
 def test_a_tare_says_the_mode_of_the_board() -> None:
     bench = stepped("emulator://4x4")
     reader = SkinReader(bench.info)

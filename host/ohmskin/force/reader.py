@@ -363,6 +363,9 @@ class SkinReader:
     def _estimated(self, scan: Scan, method: str) -> tuple[Estimate, Float, Float]:
         """The estimate by this method, its rise above rest, and the rise's deviation, (R, C)."""
         self.check_mode(scan.mode)
+        if (scan.rows, scan.columns) != (self.board.rows, self.board.columns):
+            sizes = f"{self.board.rows}x{self.board.columns} cells, now {scan.rows}x{scan.columns}"
+            raise ValueError(f"the board scanned {sizes}: configure it as before, or open it again")
         if scan.rest_ratio is not None:
             self._shared.take_recorded(scan.rest_ratio)
         if self._made_for != (method, self.rest):  # rests are compared by identity
@@ -458,6 +461,14 @@ class CalibratedSkin(Closing):
     def new_reader(self) -> SkinReader:
         """A reader of this skin for another way of reading its scans; it knows the same tares."""
         return self._reader.another()
+
+    if not TYPE_CHECKING:  # a type checker would take any name for an attribute
+
+        def __getattr__(self, name: str) -> object:
+            text = f"'{type(self).__name__}' object has no attribute '{name}'"
+            if hasattr(Device, name):
+                text += f": its device has: skin.device.{name}"
+            raise AttributeError(text, name=name, obj=self)
 
     @property
     def info(self) -> Hello:

@@ -127,6 +127,15 @@ class Device(Closing):
         self._wanted: dict[str, protocol.Value] | None = None
         self._publisher: threading.Thread | None = None
 
+    if not TYPE_CHECKING:  # a type checker would take any name for an attribute
+
+        def __getattr__(self, name: str) -> object:
+            text = f"'{type(self).__name__}' object has no attribute '{name}'"
+            if name in ("calibration", "tare", "undo_tare"):
+                text += ": skins have it where a calibration is given: "
+                text += "ohmskin.open(port, calibration='skin.json')"
+            raise AttributeError(text, name=name, obj=self)
+
     @property
     def info(self) -> Hello:
         """What the board has last said of itself."""
