@@ -72,12 +72,18 @@ def stored_bytes(file: BinaryIO) -> int:
     return stored if hasattr(os, "SEEK_DATA") else end
 
 
-def check_place(path: Path, *inputs: Path | None) -> None:
-    """Raise ValueError if `path` is no place for a file, or is one of the inputs."""
+def check_place(path: Path, *inputs: Path | None, ending: str = "") -> None:
+    """Raise ValueError if `path` is no place for a file, or is one of the inputs.
+
+    ending: what its name must end with, where the command writes one kind of file alone. Whoever
+        forgets an argument may have named a recording, which would be lost.
+    """
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(f"{path}: cannot be written: say a file in a directory there is")
     if path.exists() and any(each and each.exists() and each.samefile(path) for each in inputs):
         raise ValueError(f"{path}: is what is read: say another file to write")
+    if ending and path.suffix != ending:
+        raise ValueError(f"{path}: the file to write is a {ending}: say a name that ends so")
 
 
 @contextmanager

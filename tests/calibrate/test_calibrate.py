@@ -295,6 +295,21 @@ def test_bad_tables(run: Run, tmp_path: Path) -> None:
     )
 
 
+def test_a_recording_in_the_place_of_the_file_to_write_is_not_lost(
+    run: Run, tmp_path: Path
+) -> None:
+    """It was replaced by the calibration, and so was a sensor's log, if --forces was forgotten."""
+    for name in ("b.mcap", "sensor.csv"):
+        (kept := tmp_path / name).write_text("measured for an hour")
+        words = (str(tmp_path / "a.mcap"), str(kept), *TOLD)
+        assert_one_line(
+            run("calibrate", "recording", *words), f"{name}: the file to write is a .json"
+        )
+        readings = (str(tmp_path / "a.npz"), "--method", "joint", "--out", str(kept))
+        assert_one_line(run("estimate", *readings), f"{name}: the file to write is a .npz")
+        assert kept.read_text() == "measured for an hour"
+
+
 def test_a_missing_indenter_is_asked_for(run: Run, tmp_path: Path) -> None:
     done = run("calibrate", "table", REST, "t.csv", str(tmp_path / "skin.json"))
     assert done.code == 2

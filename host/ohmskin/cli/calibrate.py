@@ -446,7 +446,7 @@ def _options(
         raise ValueError(f"a table has conductances, which '{VOLTAGE}' knows nothing of")
     if indenter_mm2 is not None and not (math.isfinite(indenter_mm2) and indenter_mm2 > 0):
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
-    check_place(out, *inputs)
+    check_place(out, *inputs, ending=".json")
     area_m2 = None if indenter_mm2 is None else 1e-6 * indenter_mm2
     return lambda board, rest: Calibrator(board, rest, method, area_m2, wires, force)
 

@@ -310,7 +310,7 @@ def estimate(
 
     `lsq` and `regularized` are for 64 cells at most, which take 1.9 GB and some minutes a frame.
     """
-    check_place(out, readings)
+    check_place(out, readings, ending=".npz")
     with ends_in_time(_errors.show_cursor):
         loaded = load_readings(readings)
         if ref_std is not None:
