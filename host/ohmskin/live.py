@@ -7,6 +7,7 @@ wait for the next scan. Here it asks for the newest scan, which it gets at once,
 since it last asked.
 """
 
+import os
 import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 from ohmskin import opening
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
-from ohmskin.files import Closing
+from ohmskin.files import Closing, PathName
 from ohmskin.force.calibration import CalibrationLike, loaded
 from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
 from ohmskin.link.device import LOG, QUEUE_SCANS, SILENCE_TIMEOUT_S, Device, InThreads
@@ -62,17 +63,18 @@ class LiveSkin(Closing):
     ...     newest = skin.newest()  # None: no scan has come yet
 
     :raises ValueError: the calibration cannot be read.
+    :raises TypeError: the port is no text or path.
     """
 
     def __init__(
         self,
-        port: str,
+        port: PathName,
         calibration: CalibrationLike | None,
         *,
         force: bool = False,
         every: bool = True,
     ) -> None:
-        self.port = port
+        self.port = os.fspath(port)
         self.failure: Exception | None = None
         """Why there are no scans now; None while they come, and before the port was first tried."""
         self.skipped = 0

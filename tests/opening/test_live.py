@@ -127,6 +127,10 @@ def test_a_program_waits_for_what_is_not_there(monkeypatch: pytest.MonkeyPatch) 
             skin.tare()
     with pytest.raises(ValueError, match=r"no\.json: cannot be read"):
         LiveSkin(URL, "no.json")
+    with LiveSkin(Path("/dev/nothing"), None) as skin:  # as `open` takes it
+        assert skin.port == "/dev/nothing"
+    with pytest.raises(TypeError, match="not NoneType"):  # it was a traceback of the thread
+        LiveSkin(None, None)  # type: ignore[arg-type]
 
 
 def test_a_machine_that_is_too_slow_passes_scans_over(monkeypatch: pytest.MonkeyPatch) -> None:
