@@ -392,6 +392,15 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
     "missing argument": (["info"], ["port", "Usage: ohmskin info [OPTIONS] "]),
     "missing file to write": (["export", "a.mcap"], ["Usage: ohmskin export ", "..."]),
     "arguments in another order": (["flash", "/dev/ttyACM99", "uno"], ["(uno). Usage: "]),
+    "a recording to export": (
+        ["export", "/no/such.mcap", "/tmp/never.npz"],
+        ["/no/such.mcap: cannot be read: No such file"],  # it was "[Errno 2]"
+    ),
+    # It recorded no forces, and said nothing.
+    "a force sensor's port": (
+        ["record", EMULATED, "/tmp/never.mcap", "--scans", "1", "--force-unit", "g"],
+        ["--force-port"],
+    ),
     "a recording as a port": (["stream", __file__ + ".mcap"], [f"replay://{__file__}.mcap"]),
     "missing option": (["estimate", READINGS], ["--method"]),
     "not a number": (["stream", EMULATED, "--scans", "many"], ["--scans"]),

@@ -87,12 +87,14 @@ def record(
     With a force sensor: press cell after cell, and 'ohmskin calibrate recording' learns from that;
     --tare is 2 then, unless told.
     """
+    of_sensor = force_baud, force_scale, force_unit, force_column
+    if not force_port and of_sensor != (DEFAULT_BAUD, 1.0, "", ""):
+        raise ValueError("--force-scale and its like are of a sensor: say --force-port, too")
     if tare_s is None:
         tare_s = FORCE_TARE_S if force_port else 0.0
     with ExitStack() as stack:
         skin = stack.enter_context(ohmskin.open(port, start=False))
-        said = force_port, force_baud, force_scale, force_unit, force_column
-        sensor = sensor_at(skin, *said) if force_port else None
+        sensor = sensor_at(skin, force_port, *of_sensor) if force_port else None
         if sensor is not None:
             stack.enter_context(sensor).wait()
         recorder = stack.enter_context(Recorder(file, skin.info, lambda: skin.now_s))
@@ -263,7 +265,8 @@ def export(
         check_place(to, path, calibration)
     if len(pairs) == 1:
         with ends_in_time(_errors.show_cursor), _bar() as bar:
-            task = bar.add_task(pairs[0][1].name, total=pairs[0][0].stat().st_size)
+            size = pairs[0][0].stat().st_size if pairs[0][0].exists() else 0  # its reader says so
+            task = bar.add_task(pairs[0][1].name, total=size)
 
             def watch(size: int) -> None:
                 bar.update(task, completed=size)
