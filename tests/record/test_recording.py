@@ -157,6 +157,13 @@ def test_size_on_disk(path: Path, hello: Hello) -> None:
     assert path.stat().st_size < 5 * 40_000
 
 
+def test_what_is_no_message_is_refused(path: Path, hello: Hello) -> None:
+    """It was a StopIteration, which ends a generator as if all were well."""
+    words = r"a recording has .*Scan, .*, and no str$"
+    with Recorder(path, hello) as recorder, pytest.raises(TypeError, match=words):
+        recorder.add("a mark")  # type: ignore[arg-type]
+
+
 def test_an_existing_file_is_left_alone(tmp_path: Path, path: Path, hello: Hello) -> None:
     path.write_text("mine")
     with pytest.raises(RecordingError, match="there already"):

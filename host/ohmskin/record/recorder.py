@@ -121,8 +121,12 @@ class Recorder(Closing):
 
         :raises RecordingError: the file can no longer be written.
         :raises ValueError: a mark is longer than readers take.
+        :raises TypeError: it is none of these messages.
         """
-        name = next(name for name, kind in KINDS.items() if isinstance(message, kind))
+        name = next((name for name, kind in KINDS.items() if isinstance(message, kind)), None)
+        if name is None:
+            kinds = ", ".join(kind.__name__ for kind in KINDS.values())
+            raise TypeError(f"a recording has {kinds}, and no {type(message).__name__}")
         content = {"host_time_s": self.now_s(), **vars(message)}
         for array in {"codes", "rest_ratio"} & SCHEMAS[name].keys():
             readings = content[array]
