@@ -161,6 +161,7 @@ class LiveSkin(Closing):
         device, reader, failure = self._device, self._reader, self.failure
         if device is None or reader is None:
             text = "is being opened" if failure is None else f"is not there: {failure}"
+            text = "was closed" if self.closing.is_set() else text
             raise DeviceLost(f"{self.port} {text}")
         return device, reader
 

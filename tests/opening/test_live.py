@@ -158,6 +158,8 @@ def test_a_closed_skin_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
         time.sleep(0.1)  # scans wait for the thread, which then finds no failure
     assert skin.ended
     assert skin.status == f"{skin.port} was closed"
+    with pytest.raises(DeviceLost, match=r"was closed$"):  # it said "is being opened"
+        skin.tare()
 
 
 def test_what_only_shows_a_skin_gets_the_newest_scan(monkeypatch: pytest.MonkeyPatch) -> None:
