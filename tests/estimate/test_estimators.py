@@ -340,6 +340,12 @@ def test_impossible_knowledge_is_refused(wrong: dict[str, object], message: str)
         SkinKnowledge(**({"rows": 2, "columns": 2} | wrong))  # type: ignore[arg-type]
 
 
+def test_wires_in_a_plain_tuple_are_refused() -> None:
+    """It was an AttributeError of the tuple: it has no attribute 'check'."""
+    with pytest.raises(TypeError, match=r"told as WireOhm\(100, 200\), not as \(100, 200\)$"):
+        SkinKnowledge(2, 2, nominal_wire_ohm=(100, 200))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("method", ["joint", "touch"])
 @pytest.mark.parametrize("shape", [(3, 3), (6, 6)])
 def test_a_hard_touch_is_one_though_nobody_has_told_the_wires(

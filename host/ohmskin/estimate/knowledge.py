@@ -203,6 +203,9 @@ class SkinKnowledge:
                 raise ValueError("rest_ratio has cells without any reading")
             rest.setflags(write=False)
             object.__setattr__(self, "rest_ratio", rest)
+        if not hasattr(self.nominal_wire_ohm, "check"):
+            given = self.nominal_wire_ohm
+            raise TypeError(f"wires are told as WireOhm(100, 200), not as {given!r}")
         self.nominal_wire_ohm.check()
         if not 0 <= self.ref_log_std <= 1:
             raise ValueError(f"ref_log_std is {self.ref_log_std:g}, it must be from 0 to 1")
