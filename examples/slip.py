@@ -13,6 +13,7 @@ of the emulated skin:
 """
 
 import sys
+from contextlib import suppress
 
 import numpy as np
 
@@ -76,6 +77,8 @@ if __name__ == "__main__":
     if len(sys.argv) not in (3, 4):
         sys.exit(__doc__)
     try:
-        main(*sys.argv[1:])
+        with suppress(KeyboardInterrupt):  # Ctrl-C ends it
+            print("waits for a touch", flush=True)
+            main(*sys.argv[1:])
     except (ohmskin.OhmskinError, ValueError) as exc:
         sys.exit(f"slip: {exc}")

@@ -70,6 +70,12 @@ def test_ctrl_c_ends_an_example(name: str) -> None:
     assert line
 
 
+def test_ctrl_c_ends_an_example_that_waits_for_a_touch(skin_json: str) -> None:
+    """It waited in silence, and Ctrl-C was a traceback."""
+    [line] = first_lines(1, "-u", str(EXAMPLES / "slip.py"), "emulator://8x8", skin_json)
+    assert line == "waits for a touch\n"
+
+
 @pytest.mark.parametrize(("mode", "error"), [("near", 0.1), ("far", 0.02)])
 def test_estimate_prints_the_touches(
     mode: str, error: float, capsys: pytest.CaptureFixture[str]
@@ -265,7 +271,7 @@ def test_a_wrong_port_is_one_line(name: str, skin_json: str) -> None:
     calibration = [skin_json] if name in ("forces", "slip") else []
     done = python(str(EXAMPLES / f"{name}.py"), "/dev/nothing", *calibration)
     line = f"{name}: no port /dev/nothing: 'ohmskin ports' lists the ports there are\n"
-    assert done == (1, "", line)
+    assert (done.code, done.err) == (1, line)
 
 
 def test_every_example_is_run_here() -> None:
