@@ -307,6 +307,9 @@ def test_a_recording_in_the_place_of_the_file_to_write_is_not_lost(
         )
         readings = (str(tmp_path / "a.npz"), "--method", "joint", "--out", str(kept))
         assert_one_line(run("estimate", *readings), f"{name}: the file to write is a .npz")
+        (plate := tmp_path / "plate.csv").write_text("1e6,1e6\n1e6,1e6\n")
+        verify = ("verify", "emulator://2x2?speed=0", str(plate), "--json", str(kept))
+        assert_one_line(run(*verify), f"{name}: the file to write is a .json")
         assert kept.read_text() == "measured for an hour"
 
 

@@ -60,8 +60,9 @@ def verify(
     settled, noise by ADC clock, and lost scans. Leaves the board as it was. Exit code 0: all is
     within the tolerances; 1: something is not.
     """
-    for path in filter(None, (str(png or ""), json_file.removeprefix("-"))):
-        check_place(Path(path), plate)
+    for path, ending in ((str(png or ""), ""), (json_file.removeprefix("-"), ".json")):
+        if path:
+            check_place(Path(path), plate, ending=ending)
     tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
     exam = PlateExam(load_plate(plate), wires_of(wires, leads), tolerance)
     with terminal() as report, ohmskin.open(port, start=False) as device:
