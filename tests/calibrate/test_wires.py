@@ -108,6 +108,16 @@ def test_told_wires_are_one_more_piece_of_evidence(factor: float, disagrees: boo
     assert found.wires.bottom == pytest.approx(factor * 600.0, rel=0.35)
 
 
+@pytest.mark.parametrize("factor", [1e-5, 0.01, 100.0, 1000.0])
+def test_wires_that_were_told_in_another_unit_count_for_nothing(factor: float) -> None:
+    """Near 0 ohm, presses have no slope by the log of wires: a fit that is there stays there."""
+    of, cells = skin((4, 4), 100.0, 200.0), list(range(16))
+    found = found_by(of, WireOhm(factor * 100.0, factor * 200.0), cells, 0.2)
+    assert found.disagrees
+    untold = found_by(of, WireOhm(), cells, 0.2)
+    assert found.wires.both == pytest.approx(untold.wires.both, rel=1e-3)
+
+
 def test_readings_under_weights_tell_the_wires() -> None:
     """Three weights twice on every cell: conductances that were read without knowing the wires."""
     of, law, random = skin((5, 4), 300.0, 600.0), [], np.random.default_rng(4)

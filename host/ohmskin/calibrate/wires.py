@@ -44,10 +44,11 @@ N is the noise of the readings, * multiplies by elements, and [...] is 1 where i
 The fit minimises (y - y(p))^T C^-1 (y - y(p)) and the priors of p. Between such fits, the variances
 v are replaced by the most likely ones. Two leads and r lie in series, so presses tell their sum
 alone, and the prior of r divides it: what is above the usual r is taken for the leads. The
-covariance of p is that of least squares.
+covariance of p is that of least squares. Wires that were told are tried as told and as never told,
+and the more probable one of both is the answer (`WRONGLY_TOLD`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -105,6 +106,10 @@ SCATTER_LOG_STD: Final[Float] = np.array([0.5, 0.7, 1.0, 1.0, 1.0])
 # Wires are unclear if the deviation of their log is larger, and if that matters (`FoundWires`).
 # Chosen: a factor of 1.6.
 UNCLEAR_LOG: Final = 0.5
+
+# Told wires are wrong with this probability, as where kilohms are taken for ohms: then presses tell
+# alone. Chosen: so that it takes wires which are off by more than skins stretch.
+WRONGLY_TOLD: Final = 0.01
 
 # The search.
 # Both layers start from these [ohm]. Chosen: from wires that are too small, it finds larger ones;
@@ -203,8 +208,15 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     assert knowledge.rest_ratio is not None
     rest = PortReader(knowledge).read(knowledge.rest_ratio)
     rows = _rows(readings, rest.current.ravel())
-    fit = _PressFit(knowledge, rows, rest.current.ravel(), rest.current_std.ravel())
-    p, covariance = min(map(fit.minimised, STARTS_OHM), key=lambda found: found[0])[1:]
+    told, fits = knowledge.nominal_wire_ohm, [(0.0, knowledge)]
+    if told.both is not None:
+        untold = replace(knowledge, nominal_wire_ohm=WireOhm(lead=told.lead))
+        fits.append((-2 * np.log(WRONGLY_TOLD), untold))
+    tried = []
+    for cost, known in fits:
+        fit = _PressFit(known, rows, rest.current.ravel(), rest.current_std.ravel())
+        tried += [(cost + found[0], *found[1:]) for found in map(fit.minimised, STARTS_OHM)]
+    p, covariance = min(tried, key=lambda found: found[0])[1:]
     std = np.sqrt(covariance.diagonal())
     lines = np.exp(p[:2]) * std[:2] * (knowledge.columns, knowledge.rows)
     unclear = (std[:2] > UNCLEAR_LOG) & (lines > 1 / HIGHEST_TOUCH_SIEMENS)
@@ -214,7 +226,7 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     top_std, bottom_std = std[:2].tolist()
     wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std_ohm)
     presses = np.unique(readings.press).size
-    return FoundWires(wires, knowledge.nominal_wire_ohm, presses, layers)
+    return FoundWires(wires, told, presses, layers)
 
 
 def _rows(readings: PressReadings, rest_current: Float) -> _Rows:
@@ -371,7 +383,7 @@ class _PressFit:
     def minimised(self, start_ohm: float) -> tuple[float, Float, Float]:
         """The fit that starts from segments of `start_ohm`, both layers alike.
 
-        Returns -2 log likelihood, p, and the covariance of p (7, 7).
+        Returns -2 log of the evidence, p, and the covariance of p (7, 7).
         """
         from scipy.optimize import least_squares
 
@@ -392,7 +404,10 @@ class _PressFit:
             p = found.x
             scatter, score = self._scatter(p, scatter)
         from_centre = (p - self._centre) / self._std
-        return score + float(from_centre @ from_centre), p, np.linalg.inv(found.jac.T @ found.jac)
+        precision = found.jac.T @ found.jac
+        # Of the likelihood times the prior, by Laplace's integral over p.
+        score += float(from_centre @ from_centre) + 2 * float(np.log(self._std).sum())
+        return score + float(np.linalg.slogdet(precision)[1]), p, np.linalg.inv(precision)
 
     def _start(self, start_ohm: float) -> Float:
         """p with these wires, and the level of the law by the median row."""
