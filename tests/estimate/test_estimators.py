@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from network import laplacian_readings
 from ohmskin.circuit.configurations import ratio_from_current
+from ohmskin.circuit.ports import solve_ports
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
-from ohmskin.estimate.matrix import solve_ports, voltage_squared
+from ohmskin.estimate.matrix import voltage_squared
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.estimate.ohm import voltage_level
 from ohmskin.record.readings import estimate_file

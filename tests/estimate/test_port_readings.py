@@ -7,14 +7,14 @@ from itertools import product
 import numpy as np
 import pytest
 
-from network import SkinCircuit
+from network import SkinCircuit, floating_share
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, port_resistance_ohm, readings
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_faults import ALIKE_FRAMES, DOUBT_FRAMES
 from ohmskin.estimate.port_readings import PortReader
 from skins import shorted_readings, ten_bits, told
-from studies.trials import random_trial, skin_at_rest, touch
+from studies.trials import Trial, finger_trial, random_trial, skin_at_rest, touch
 
 
 def reader_of(rest_ratio: Float | None) -> PortReader:
@@ -224,3 +224,16 @@ def test_what_moves_both_near_ends_alike_is_once_in_what_wires_lose(rest: Skin) 
 def test_without_rest_readings_nothing_is_said_of_a_change(rest: Skin) -> None:
     dark = replace(rest, cell_siemens=np.full((8, 8), 1e-9))
     assert not reader_of(None).read(ten_bits(readings(dark))).fault
+
+
+@pytest.mark.parametrize("trial", [random_trial(8, 8, 6, 8, 3), finger_trial(8, 8, 8, 3)])
+def test_lines_draw_from_the_end_that_they_are_nearer_to(trial: Trial) -> None:
+    """The sums of the other currents of row and column told too little: references limit these."""
+    drawn, errors = 8.0 / 1024, []
+    for skin in trial.frames:
+        exact, share = readings(skin), floating_share(skin)
+        row, column = drawn * (1 + share), drawn * (1 - share)
+        ratio = exact + np.stack([-row, -column, column, row], axis=-1)
+        found = reader_of(trial.readings.rest_ratio).read(ratio)
+        errors.append(skin.ref_top_ohm * found.current - exact[..., 3])
+    assert 1024 * np.sqrt(np.mean(np.square(errors))) < 0.35

@@ -134,6 +134,23 @@ def laplacian_readings(
     return ratio
 
 
+def floating_share(skin: Skin) -> Float:
+    """The mean of 2 v - 1 over all lines but row i and column j, for each port (R, C).
+
+    v: potentials of near ends over Vdd, where Vdd and ground drive row and column by references.
+    """
+    alone, (rows, columns) = skin_network(skin), skin.shape
+    top, bottom = alone.nodes, alone.nodes + 1
+    ohm = np.concatenate([alone.branch_ohm, [skin.ref_top_ohm, skin.ref_bottom_ohm]])
+    share = np.empty(skin.shape)
+    for i, j in np.ndindex(rows, columns):
+        driven = [i, rows + j]
+        tail, head = np.append(alone.tail, [top, bottom]), np.append(alone.head, driven)
+        line_v = Network(alone.nodes + 2, tail, head, ohm).node_v({top: 1.0, bottom: 0.0})
+        share[i, j] = np.mean(2 * np.delete(line_v[: rows + columns], driven) - 1)
+    return share
+
+
 def leaks(shape: tuple[int, int], leak_ohm: float) -> tuple[NDArray[np.intp], Float]:
     """Branches between nodes of `skin_network` (2, n), and their resistances (n,): a damp skin.
 

@@ -24,6 +24,18 @@ from ohmskin.circuit.small import solve_lower
 _triangle = lru_cache(maxsize=8)(np.tri)
 
 
+def solve_ports(cell_siemens: Float) -> tuple[Float, Float]:
+    """rho (R, C) [ohm], and Z, of cells (R, C) [S], all > 0, whose stripes have no resistance."""
+    rows, columns = cell_siemens.shape
+    laplacian = np.zeros((rows + columns, rows + columns))
+    laplacian[:rows, rows:] = -cell_siemens
+    laplacian[rows:, :rows] = -cell_siemens.T
+    degree = np.concatenate([cell_siemens.sum(axis=1), cell_siemens.sum(axis=0)])
+    laplacian.ravel()[:: rows + columns + 1] = degree
+    impedance, port_ohm = impedance_of(laplacian, rows)
+    return np.maximum(port_ohm, 0.0), impedance
+
+
 def port_difference(lines: Float, rows: int) -> Float:
     """For each port, the values of its row less those of its column: (RC, n), from (R+C, n)."""
     return (lines[:rows, None] - lines[None, rows:]).reshape(-1, lines.shape[1])

@@ -43,8 +43,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.ports import port_difference
-from ohmskin.circuit.skin import impedance_of
+from ohmskin.circuit.ports import port_difference, solve_ports
 from ohmskin.circuit.small import gram
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinKnowledge
@@ -75,18 +74,6 @@ _LARGEST_DAMPING: Final = 1e12
 # A step is solved so often at most, each time with those cells held at their bound that would have
 # gone beyond it. Chosen: cells that a few rounds do not find are found by the next step.
 _BOUND_ROUNDS: Final = 5
-
-
-def solve_ports(cell_siemens: Float) -> tuple[Float, Float]:
-    """rho (R, C) [ohm], and Z, of cells (R, C) [S], all > 0, whose stripes have no resistance."""
-    rows, columns = cell_siemens.shape
-    laplacian = np.zeros((rows + columns, rows + columns))
-    laplacian[:rows, rows:] = -cell_siemens
-    laplacian[rows:, :rows] = -cell_siemens.T
-    degree = np.concatenate([cell_siemens.sum(axis=1), cell_siemens.sum(axis=0)])
-    laplacian.ravel()[:: rows + columns + 1] = degree
-    impedance, port_ohm = impedance_of(laplacian, rows)
-    return np.maximum(port_ohm, 0.0), impedance
 
 
 def voltage_squared(impedance: Float, rows: int, scale: Float | float = 1.0) -> Float:

@@ -52,12 +52,12 @@ from ohmskin.circuit.configurations import (
     READINGS_PER_CELL,
     ratio_from_current,
 )
-from ohmskin.circuit.ports import port_difference
+from ohmskin.circuit.ports import port_difference, solve_ports
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.ctrl_c import ctrl_c_kept
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, SkinKnowledge
-from ohmskin.estimate.matrix import CellFit, solve_ports
+from ohmskin.estimate.matrix import CellFit
 from ohmskin.estimate.port_faults import FAULT_STDS, cell_of
 from ohmskin.estimate.port_readings import PortReadings
 

@@ -13,6 +13,8 @@ R_k      (n,)      reference resistor that reading k senses                     
 s_k      (n,)      sign of the current in reading k: +1 or -1                     1
 b_k      (n,)      reading k where no current flows: 0 or 1                       V/Vdd
 c        (R, C)    half of the current that floating lines draw from a port       S
+q        (R, C)    share of it that the row gives, less that of the column        1
+Z        (N, N)    impedance of the network of cells; N = R + C lines             ohm
 a, b     (R, C)    potentials of the near ends of row and column                  V/Vdd
 e, f     (R, C)    potentials of the far ends of row and column                   V/Vdd
 U        (R, C)    voltage between the sensed ends, e - f                         V/Vdd
@@ -35,12 +37,23 @@ residuals shows only the offset that both nodes have in common.
 **Lines that charge.** The lines of other ports float. They have a capacitance, and they charge
 through the skin until they have settled. Until then the current into the row is larger than the
 current out of the column by what these lines draw, 2 c on average over both polarities. Least
-squares give the mean of both currents. How much the lines draw from the row, and how much from the
-column, depends on how well each conducts to them. So it is in the ratio of I_row, the sum of the
-currents of the row's other ports, to I_column, the same sum of the column. The port's own current
-is that into the row, I + c, less what the lines draw from the row:
+squares give the mean of both currents. The port's own current is that into the row, I + c, less
+what the lines draw from the row:
 
-    I + c - 2 c I_row / (I_row + I_column) = I - c (I_row - I_column) / (I_row + I_column) .
+    I + c - 2 c (1 + q) / 2 = I - c q .
+
+By reciprocity, the row gives v_l of a charge that line l takes, and the column 1 - v_l, with v_l
+the potential over Vdd that the line has in the end, the row driven high and the column low. All
+lines have about the same capacitance, so q is the mean of 2 v_l - 1 over all that float. Per
+current from row i to column j, line l has the potential Z_li - Z_lj, if the middle of row and
+column has (Z_ii - Z_jj) / 2. So in sum over all lines, where row and column cancel,
+
+    q = I N / (N - 2) (w_j - w_i) ,  w_l = Z_ll - 2 (mean of Z_lk over all k) .
+
+Z is that of cells without wires. They are not known yet, but from the conductances of the ports,
+G = 1 / (1 / I - R_s), nearly: of each, paths around the cell have a part. They lead through the
+other cells of the row, and then those of the column. With G_row and G_column the sums of the other
+G of both, and P = G_row G_column / (G_row + G_column), a cell is taken for G^2 / (G + P).
 
 **Far ends.** Nothing draws current from a far end. So its potential differs from that of the near
 end by what the wires of the line lose, and
@@ -69,7 +82,8 @@ from ohmskin.circuit.configurations import (
     node_ratio,
     reference_ohm,
 )
-from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.circuit.ports import solve_ports
+from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinKnowledge
 
 # Largest offset of a sense node that is believed, over Vdd. A larger one stays in the residuals and
 # counts as noise. Chosen: nearly twice the absolute accuracy that the ATmega328P's data sheet gives
@@ -108,11 +122,17 @@ class NearReadings(NamedTuple):
     offset_ratio: Float
 
 
-def row_share(current: Float) -> Float:
-    """(I_row - I_column) / (I_row + I_column) of currents (R, C)."""
-    by_row, by_column = (current.sum(axis=axis, keepdims=True) - current for axis in (1, 0))
-    # Noise may make currents negative, and so the share larger than it can be.
-    share = (by_row - by_column) / np.maximum(by_row + by_column, 1e-12)
+def row_share(current: Float, ref_ohm: float) -> Float:
+    """q by currents (R, C); ref_ohm: R_s."""
+    # Noise may make currents negative.
+    port_ohm = 1.0 / np.maximum(current, MIN_CELL_SIEMENS) - ref_ohm
+    port = 1.0 / np.clip(port_ohm, 1.0 / MAX_CELL_SIEMENS, 1.0 / MIN_CELL_SIEMENS)
+    by_row, by_column = (port.sum(axis=axis, keepdims=True) - port for axis in (1, 0))
+    around = by_row * by_column / np.maximum(by_row + by_column, MIN_CELL_SIEMENS)
+    _, impedance = solve_ports(port * port / (port + around))
+    rows, lines = len(current), len(impedance)
+    away = impedance.diagonal() - 2.0 * impedance.mean(axis=0)
+    share = lines / max(lines - 2, 1) * current * (away[rows:] - away[:rows, None])
     return np.asarray(np.clip(share, -1.0, 1.0))
 
 
@@ -129,6 +149,7 @@ class NearEnds:
         reference = reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)[:n]
         self._slope_ohm, self._at_no_current = READING_SIGN[:n] * reference, READING_OFFSET[:n]
         self.square_ohm = float(np.sum(reference**2))  # sum_k R_k^2
+        self._ref_ohm = knowledge.ref_ohm  # R_s
         self._into_row = _INTO_ROW[:n] / reference / n
         # The node of each reading, A to D: 0 is that of the row, 1 that of the column.
         self._node = [0, 1, 1, 0][:n]
@@ -151,7 +172,7 @@ class NearEnds:
     def charging(self, near: NearReadings) -> Float:
         """What lines that charge add to the currents of least squares, (R, C) [S]."""
         charging = near.residual @ self._into_row  # c
-        return np.asarray(charging * row_share(near.current))
+        return np.asarray(charging * row_share(near.current, self._ref_ohm))
 
     def best_three(self, ratio: Float) -> tuple[float, float]:
         """Leave out one of the four readings (4,) of a cell in mode near: the one that fits least.

@@ -10,7 +10,7 @@ e       (2, R, C)  what the two readings of a node are off by, their mean       
 o       (2,)       offset of each node                                            V/Vdd
 c       (R, C)     what floating lines draw from a port, as residuals show it     V/Vdd
 kappa              what of it is in the difference of both e                      1
-q       (R, C)     (I_row - I_column) / (I_row + I_column)                        1
+q       (R, C)     share of it that the row gives, less that of the column        1
 m       (R, C)     what all four readings have in common                          V/Vdd
 phi     (R, C)     mean of 4 y_k (1 - y_k) over the readings                      1
 beta               bow of the converter, in the middle of its scale               V/Vdd
@@ -103,7 +103,7 @@ class MirrorReadings:
     """Takes whole frames of a skin in mode near, one after the other."""
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
-        self._rounding = knowledge.ratio_std**2
+        self._rounding, self._ref_ohm = knowledge.ratio_std**2, knowledge.ref_ohm
         self.reset()
 
     def reset(self) -> None:
@@ -128,7 +128,7 @@ class MirrorReadings:
         kappa = float((apart * by_charge)[sound].sum())
         kappa /= max(float((by_charge[sound] ** 2).sum()), 1e-30)
         nodes_apart = float((apart - kappa * charge)[sound].mean())
-        share = row_share(near.current)
+        share = row_share(near.current, self._ref_ohm)
         common = 0.5 * (row + column - share * (apart - nodes_apart))
         weight = 4.0 / (1.0 + share**2)
         shape = bow_shape(near.ratio).mean(axis=2)

@@ -25,11 +25,10 @@ decides where lines charge. A single reading has v_I = v. Several show it as in 
 If A and B alone are read, lines that charge add to A, and take less from B, which is read a slot
 later. Of what they make in the difference of both currents, I_A - I_B, A has too much by the share
 
-    f = FIRST_SHARE + ROW_SHARE (I_row - I_column) / (I_row + I_column) ,
+    f = FIRST_SHARE + ROW_SHARE q ,
 
-and B lacks the remainder. (`port_currents` says why I_row and I_column decide what is drawn from
-the row, of which A is a reading.) I has R_A^2 / sum R_k^2 of the first in it, and lacks
-1 - R_A^2 / sum R_k^2 of the second, so that
+and B lacks the remainder. (`port_currents` has q. A is a reading of the row.) I has R_A^2 / sum
+R_k^2 of the first in it, and lacks 1 - R_A^2 / sum R_k^2 of the second, so that
 
     I -= (f - 1 + R_A^2 / sum R_k^2) max(0, 1 - n v / v_cell) (I_A - I_B) ,
     n = max(1, CLEAR_NOISES v / mean of v_cell) .
@@ -104,7 +103,7 @@ class PartialEnds:
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         self._reference = reference_ohm(knowledge.ref_top_ohm, knowledge.ref_bottom_ohm)
-        self._rounding = knowledge.ratio_std**2
+        self._rounding, self._ref_ohm = knowledge.ratio_std**2, knowledge.ref_ohm
         nothing = np.zeros((knowledge.rows, knowledge.columns))
         ports = PortCurrents(nothing, nothing + 1.0 / knowledge.ref_ohm)
         self._rest, self._mirrors = Shown(ports, 0.0), MirrorReadings(knowledge)
@@ -167,7 +166,7 @@ class PartialEnds:
                 noises = max(1.0, CLEAR_NOISES * noise / max(float(np.nanmean(by_cell)), 1e-30))
                 charged = np.maximum(1.0 - noises * noise / np.maximum(by_cell, 1e-30), 0.0)
                 first = FIRST_SHARE + ROW_SHARE * row_share(
-                    np.where(np.isnan(current), self._last.ports.current, current)
+                    np.where(np.isnan(current), self._last.ports.current, current), self._ref_ohm
                 )
                 weight = slope[0] ** 2 / square_ohm
                 taken = (first - 1 + weight) * charged
