@@ -550,3 +550,42 @@ def test_a_reader_of_one_cell_that_was_reset_answers_as_a_fresh_one() -> None:
             again, first = (reader.read(ratio, in_order=True) for reader in (used, fresh))
             np.testing.assert_array_equal(again.current, first.current)
             np.testing.assert_array_equal(again.current_std, first.current_std)
+
+
+def test_currents_of_one_reading_have_the_excess_of_whole_frames() -> None:
+    """A sample capacitor moves readings of whole frames, rest as well, towards the other node."""
+    random, excess = np.random.default_rng(16), 1.2 / 1024
+    rest, touched = pressed(random)
+
+    def whole(current: Float) -> Float:
+        return a_board(current + excess * (1.0 - 2.0 * current), random)
+
+    reader = PortReader(knowledge(np.mean([whole(rest) for _ in range(30)], axis=0)))
+    off_by = []
+    for _ in range(20):
+        for frame in (whole(touched), *(quick_of(a_board(touched, random)) for _ in range(3))):
+            found = reader.read(frame, in_order=True)
+        off_by.append(1024 * (3e4 * found.current - touched) / (1.0 - 2.0 * touched))
+    # As much as in whole frames, also where a cell is pressed, and from the second one on.
+    assert np.mean(off_by[2:]) == pytest.approx(1024 * excess, abs=0.15)
+    assert np.mean(np.array(off_by)[2:, 2:4, 2:4]) == pytest.approx(1024 * excess, abs=1.0)
+    reader.reset()
+    found = reader.read(quick_of(a_board(touched, random)), in_order=True)
+    assert abs(np.median(1024 * (3e4 * found.current - touched))) < 0.4
+
+
+@pytest.mark.parametrize("scene", list(TRIALS))
+def test_a_skin_that_changes_around_whole_frames_shows_no_excess(scene: str) -> None:
+    """Each whole frame is of another touch than the frame after it, and the frame before."""
+    for seed in range(2, 5):
+        made, rest, frames = trial(scene, seed)
+        exact = made.readings.ratio[..., 1]
+        reader, errors = PortReader(knowledge(rest)), []
+        for number in range(42):
+            before, whole, after = (frames[(number * step) % 14] for step in (3, 5, 1))
+            reader.read(quick_of(before), in_order=True)
+            reader.read(whole, in_order=True)
+            found = reader.read(quick_of(after), in_order=True)
+            error = 3e4 * found.current - exact[number % 14]
+            errors.append(1024 * error / (1.0 - 2.0 * exact[number % 14]))
+        assert abs(np.median(errors)) < 0.5

@@ -40,7 +40,7 @@ it; one does not. It belongs to the converter, so all frames tell the same beta,
 but it is at most _MOST_BOW_STDS BOW_STD_RATIO, either way. Other causes make m depend on phi, too.
 So that they are forgotten, each frame takes a share off both sums over the frames before,
 
-    i / (1 + i) / _BOARD_FRAMES ,  i = BOW_STD_RATIO^2 / v sum w (phi - mean phi)^2 of this frame.
+    i / (1 + i) / BOARD_FRAMES ,  i = BOW_STD_RATIO^2 / v sum w (phi - mean phi)^2 of this frame.
 
 A frame with i far below 1 shows hardly anything of beta, as one of an untouched skin: it takes
 hardly anything off.
@@ -72,9 +72,9 @@ BOW_STD_RATIO: Final = 0.001
 _MOST_BOW_STDS: Final = 3.0
 # Frames taken whose noise is averaged, and after which a bow that they show has mostly replaced the
 # one before. Chosen: v is then known to some percent, and a bow to a tenth of an LSB of 10 bits.
-_BOARD_FRAMES: Final = 30
+BOARD_FRAMES: Final = 30
 # With fewer cells, all are usual. Chosen: so few hardly show which of them has a cause of its own.
-_FEW_CELLS: Final = 16
+FEW_CELLS: Final = 16
 # Sign of the difference of both offsets in that of each reading.
 APART_SIGN: Final = np.array([1.0, -1.0, -1.0, 1.0])
 
@@ -164,7 +164,7 @@ class MirrorReadings:
         """From phi, m and w of k cells. Returns the share of beta that this frame decides."""
         away = shape - np.average(shape, weights=weight)
         square = float(np.sum(weight * away**2))
-        kept = 1.0 - square / (square + self._unknown_bow) / _BOARD_FRAMES
+        kept = 1.0 - square / (square + self._unknown_bow) / BOARD_FRAMES
         self._product = kept * self._product + float(np.sum(weight * common * away))
         self._square = kept * self._square + square
         return square / (self._square + self._unknown_bow)
@@ -172,7 +172,7 @@ class MirrorReadings:
     def _learn_noise(self, square: Float, fitted: float) -> None:
         """From w (m - beta phi - its median)^2 of k cells; fitted: h."""
         level = max(self._rounding, float(np.median(square)) / MEDIAN_CHI2[1])
-        if square.size >= _FEW_CELLS:
+        if square.size >= FEW_CELLS:
             square = square[square <= USUAL_STDS**2 * level]
         if square.size > fitted:
             self._average(float(square.sum()), square.size - fitted)
@@ -187,6 +187,6 @@ class MirrorReadings:
 
     def _average(self, misfit: float, degrees: float) -> None:
         """One more frame counts to v."""
-        self._frames = min(self._frames + 1, _BOARD_FRAMES)
+        self._frames = min(self._frames + 1, BOARD_FRAMES)
         self._misfit += (misfit - self._misfit) / self._frames
         self._degrees += (degrees - self._degrees) / self._frames

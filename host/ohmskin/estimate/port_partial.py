@@ -44,6 +44,8 @@ Offsets have noise, too. With V_m and V_d the variances of their mean and their 
 
 is added to v_I. It matters where cells are few.
 
+What whole frames show too much in all currents, as rest does, is added (`port_excess`).
+
 A port that was not read keeps its last current. Its deviation grows by `STALE_SHARE` of the current
 with each frame since then.
 """
@@ -62,6 +64,7 @@ from ohmskin.circuit.configurations import (
 )
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import NearReadings, PortCurrents, row_share
+from ohmskin.estimate.port_excess import Excess
 from ohmskin.estimate.port_mirror import APART_SIGN, BoardShown, MirrorReadings, bow_shape
 from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE
 
@@ -107,6 +110,7 @@ class PartialEnds:
         nothing = np.zeros((knowledge.rows, knowledge.columns))
         ports = PortCurrents(nothing, nothing + 1.0 / knowledge.ref_ohm)
         self._rest, self._mirrors = Shown(ports, 0.0), MirrorReadings(knowledge)
+        self._excess = Excess(knowledge)
         self._no_age = nothing
         self.reset()
 
@@ -115,6 +119,7 @@ class PartialEnds:
         self._last = self._rest
         self._board = BoardShown(np.zeros(READINGS_PER_CELL))
         self._mirrors.reset()
+        self._excess.reset()
         self.region: NDArray[np.intp] | None = None
         self._age: Float = np.full(self._rest.ports.current.shape, _NEVER_FRAMES)
 
@@ -123,6 +128,8 @@ class PartialEnds:
         # The readings of a frame may all agree by chance. Such a frame, of noise 0, tells nothing.
         noises = [each for each in (shown.noise, self._rest.noise) if each]
         self._last = shown._replace(noise=min(noises, default=0.0))
+        if shown.is_live:
+            self._excess.keep(shown.ports.current)
         self.region = None
         self._age = self._no_age  # never written into
 
@@ -176,6 +183,8 @@ class PartialEnds:
         offset = of_mean * slope.sum() ** 2 + 0.25 * of_apart * (slope @ APART_SIGN[kinds]) ** 2
         error = error + noise * offset / square_ohm
         std = np.broadcast_to(np.sqrt(error / square_ohm), current.shape)
+        if not kinds.all():
+            current = self._excess.added(current, tuple(np.flatnonzero(kinds)))
         is_read, last = ~np.isnan(current), self._last.ports
         ports = PortCurrents(
             np.where(is_read, current, last.current), np.where(is_read, std, last.std)

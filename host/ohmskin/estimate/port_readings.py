@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a frame's readings to what estimators take: a current for each port, and what is wrong.
 
-`PortReader` brings five subjects together, of which each is a module:
+`PortReader` brings six subjects together, of which each is a module:
 
 - `port_currents`: the current through each port, without offsets of the board and without what
   floating lines draw; at far ends also what the wires lose.
 - `port_partial`: the same where not all was read.
 - `port_mirror`: what whole frames show of the board, for frames of which not all is read.
+- `port_excess`: what whole frames show more of every current than frames of fewer readings.
 - `port_noise`: the standard deviation of each current, by how far readings disagree and change.
 - `port_faults`: what no touches can make of a skin.
 """
