@@ -140,9 +140,10 @@ def test_files_of_before_leads_and_modes_are_read(tmp_path: Path) -> None:
 
 
 def test_forces_far_beyond_those_of_the_presses_are_less_probable() -> None:
-    """By the posterior on a fine grid: its mean, if that is below the curve, and its deviation.
+    """The prior is flat up to the largest press, and falls as 1 / q^2 beyond.
 
-    The prior is flat up to the largest press, and falls as 1 / q^2 beyond.
+    On a fine grid, the force is the mean of a normal posterior, if that is below the curve. The
+    deviation is that of forces whose reciprocal is normal: resistances are.
     """
     known = replace(calibration(), largest_force_n=8.0)
     rise = np.array([[200e-6, 20e-6, 300e-6], [400e-6, 200e-6, 200e-6]])
@@ -152,20 +153,26 @@ def test_forces_far_beyond_those_of_the_presses_are_less_probable() -> None:
     found, found_std = known.forces(rise, rise_std, touched)
     is_lower = np.array([[True, False, True], [True, False, False]])
     np.testing.assert_array_equal(found < plain, is_lower)
-    kept = np.where(touched & (plain_std > 8.0), 8.0, plain_std)
-    assert kept[0, 1] == kept[0, 2] == 8.0
+    is_open = touched & ~np.isnan(rise_std)
+    np.testing.assert_array_equal(found_std[~is_open], plain_std[~is_open])
     assert plain_std[0, 0] < 2.0
-    may_be_above = touched & ~np.isnan(rise_std)
-    np.testing.assert_array_equal(found_std[~may_be_above], plain_std[~may_be_above])
-    grid_n = np.linspace(1e-4, 60.0, 600_000)
-    for row, column in np.argwhere(may_be_above):
-        force_n, std_n = plain[row, column], kept[row, column]
-        share = np.exp(-0.5 * ((grid_n - force_n) / std_n) ** 2)
-        share[grid_n > 8.0] *= (8.0 / grid_n[grid_n > 8.0]) ** 2
+    assert (plain_std[0, 1:] > 8.0).all()
+
+    def prior(force_n: Float) -> Float:
+        return np.where(force_n > 8.0, (8.0 / force_n) ** 2, 1.0)
+
+    grid_n, z = np.linspace(1e-4, 60.0, 600_000), np.linspace(-4.0, 4.0, 100_001)
+    for row, column in np.argwhere(is_open):
+        force_n, std_n = plain[row, column], plain_std[row, column]
+        share = np.exp(-0.5 * ((grid_n - force_n) / min(std_n, 8.0)) ** 2) * prior(grid_n)
         likely_n = min(share @ grid_n / share.sum(), force_n)
         assert found[row, column] == pytest.approx(likely_n, rel=5e-3)
-        std_of_grid_n = np.sqrt(share @ (grid_n - likely_n) ** 2 / share.sum())
-        assert found_std[row, column] == pytest.approx(std_of_grid_n, rel=3e-2)
+        least = 1 / (force_n + 4.0 * std_n)
+        may_be_n = 1 / (1 / force_n - z / 4.0 * (1 / force_n - least))
+        share = np.exp(-0.5 * z**2) * prior(may_be_n)
+        std_of_grid_n = np.sqrt(share @ (may_be_n - likely_n) ** 2 / share.sum())
+        assert found_std[row, column] == pytest.approx(std_of_grid_n, rel=1e-2)
+        assert 0 < found_std[row, column] < std_n
     same = replace(known, largest_force_n=None).forces(rise, rise_std, touched)
     np.testing.assert_array_equal(same[0], plain)
 

@@ -236,16 +236,21 @@ class Calibration:
 
         rise, rise_std: above rest, (..., R, C) [S; 1 for `voltage`]; touched: which cells are.
 
-        They are `model.predict`, F with deviation s. But where s is large, readings may allow any
-        hard touch. So where s of a touched cell is above the largest force L of the presses, it is
-        L. And any force q is as probable as others up to L, and above L by (L / q)^2: twice as hard
-        as ever pressed is a quarter as probable. Where the mean of what this leaves,
+        They are `model.predict`, F with deviation s. But where s of a touched cell is large,
+        readings may allow any hard touch. Then a force q is as probable as others up to the largest
+        force L of the presses, and above L by (L / q)^2: twice as hard as ever pressed is a quarter
+        as probable. The force is the mean of what this leaves of a normal,
 
-            p(q) ~ exp(-(q - F)^2 / (2 s^2)) min(1, (L / q)^2) ,   q > 0 ,
+            p(q) ~ exp(-(q - F)^2 / (2 s'^2)) min(1, (L / q)^2) ,   q > 0 ,   s' = min(s, L) ,
 
-        is below F, it takes the place of F. (Not where it is higher: s is that of errors upwards,
-        and there may be less of them downwards.) The deviation is that of all q about the force
-        that is given.
+        where that is below F. Its deviation: F + 4 s is a limit of errors upwards that are four
+        deviations large (`Estimate`). Errors are normal in the resistance of a cell, so those of z
+        deviations lead to
+
+            q_z = F (F + 4 s) / (F + 4 s - z s) ,
+
+        and the deviation is that of all q_z about the force that is given, weighed by
+        exp(-z^2 / 2) min(1, (L / q_z)^2). It is less than s, and 0 only where F is.
 
         Raises ValueError as `predict` does.
         """
@@ -253,11 +258,9 @@ class Calibration:
         largest_n = self.largest_force_n
         if largest_n is None:
             return force_n, std_n
-        std_n = np.where(touched & (std_n > largest_n), largest_n, std_n)
-        may_be_above = touched & (force_n + _OPEN_STDS[-1] * std_n > largest_n)
-        if may_be_above.any():
-            uncertain = force_n[may_be_above], std_n[may_be_above]
-            force_n[may_be_above], std_n[may_be_above] = _likely(*uncertain, largest_n)
+        is_open = touched & (force_n > 0) & (force_n + _OPEN_STDS[-1] * std_n > largest_n)
+        if is_open.any():
+            force_n[is_open], std_n[is_open] = _likely(force_n[is_open], std_n[is_open], largest_n)
         return force_n, std_n
 
     def save(self, path: PathName) -> None:
@@ -281,13 +284,20 @@ class Calibration:
 
 
 def _likely(force_n: Float, std_n: Float, largest_n: float) -> tuple[Float, Float]:
-    """`Calibration.forces` of n touched cells, each (n,), by a sum over q."""
-    q = force_n[:, None] + std_n[:, None] * _OPEN_STDS
-    prior = (q > 0) * np.minimum(largest_n / np.maximum(q, largest_n), 1.0) ** 2
-    share = prior * np.exp(-0.5 * _OPEN_STDS**2)
-    share /= share.sum(axis=1, keepdims=True)
-    likely_n = np.minimum((share * q).sum(axis=1), force_n)
-    return likely_n, np.sqrt((share * (q - likely_n[:, None]) ** 2).sum(axis=1))
+    """`Calibration.forces` of n touched cells, each (n,), by sums over q."""
+    F, s, z = force_n[:, None], std_n[:, None], _OPEN_STDS
+
+    def shares(q: Float) -> Float:
+        prior = (q > 0) * np.minimum(largest_n / np.maximum(q, largest_n), 1.0) ** 2
+        share = prior * np.exp(-0.5 * z**2)
+        return np.asarray(share / share.sum(axis=1, keepdims=True))
+
+    q = F + np.minimum(s, largest_n) * z
+    likely_n = np.minimum((shares(q) * q).sum(axis=1), force_n)
+    limit = F + z[-1] * s
+    q = F * limit / (limit - z * s)
+    square = (shares(q) * (q - likely_n[:, None]) ** 2).sum(axis=1)
+    return likely_n, np.sqrt(square)
 
 
 def _null(array: Float) -> NDArray[Any]:
