@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ohmskin.arrays import Float
@@ -140,41 +140,47 @@ def test_files_of_before_leads_and_modes_are_read(tmp_path: Path) -> None:
 
 
 def test_forces_far_beyond_those_of_the_presses_are_less_probable() -> None:
-    """The prior is flat up to the largest press, and falls as 1 / q^2 beyond.
-
-    On a fine grid, the force is the mean of a normal posterior, if that is below the curve. The
-    deviation is that of forces whose reciprocal is normal: resistances are.
-    """
+    """By a fine grid of logs: flat up to the largest press, and as 1 / q^3 beyond."""
     known = replace(calibration(), largest_force_n=8.0)
     rise = np.array([[200e-6, 20e-6, 300e-6], [400e-6, 200e-6, 200e-6]])
     rise_std = np.array([[10e-6, 200e-6, 2e-3], [50e-6, 200e-6, np.nan]])
     touched = np.array([[True, True, True], [True, False, True]])
     plain, plain_std = known.model.predict(rise, rise_std)
     found, found_std = known.forces(rise, rise_std, touched)
-    is_lower = np.array([[True, False, True], [True, False, False]])
-    np.testing.assert_array_equal(found < plain, is_lower)
     is_open = touched & ~np.isnan(rise_std)
+    np.testing.assert_array_equal(found[~is_open], plain[~is_open])
     np.testing.assert_array_equal(found_std[~is_open], plain_std[~is_open])
     assert plain_std[0, 0] < 2.0
     assert (plain_std[0, 1:] > 8.0).all()
-
-    def prior(force_n: Float) -> Float:
-        return np.where(force_n > 8.0, (8.0 / force_n) ** 2, 1.0)
-
-    grid_n, z = np.linspace(1e-4, 60.0, 600_000), np.linspace(-4.0, 4.0, 100_001)
     for row, column in np.argwhere(is_open):
         force_n, std_n = plain[row, column], plain_std[row, column]
-        share = np.exp(-0.5 * ((grid_n - force_n) / min(std_n, 8.0)) ** 2) * prior(grid_n)
-        likely_n = min(share @ grid_n / share.sum(), force_n)
-        assert found[row, column] == pytest.approx(likely_n, rel=5e-3)
-        least = 1 / (force_n + 4.0 * std_n)
-        may_be_n = 1 / (1 / force_n - z / 4.0 * (1 / force_n - least))
-        share = np.exp(-0.5 * z**2) * prior(may_be_n)
-        std_of_grid_n = np.sqrt(share @ (may_be_n - likely_n) ** 2 / share.sum())
+        four_stds = np.log((force_n + 4.0 * std_n) / force_n)
+        logs = np.log(force_n) + np.linspace(-four_stds, four_stds, 100_001)
+        share = np.exp(-8.0 * ((logs - np.log(force_n)) / four_stds) ** 2)
+        share[logs > np.log(8.0)] *= np.exp(3.0 * (np.log(8.0) - logs[logs > np.log(8.0)]))
+        likely_n = np.exp(share @ logs / share.sum())
+        assert found[row, column] == pytest.approx(likely_n, rel=3e-3)
+        assert likely_n < force_n
+        std_of_grid_n = np.sqrt(share @ (np.exp(logs) - likely_n) ** 2 / share.sum())
         assert found_std[row, column] == pytest.approx(std_of_grid_n, rel=1e-2)
-        assert 0 < found_std[row, column] < std_n
+        assert found_std[row, column] < std_n
     same = replace(known, largest_force_n=None).forces(rise, rise_std, touched)
     np.testing.assert_array_equal(same[0], plain)
+
+
+@given(st.floats(1e-6, 1e-3), st.floats(0.0, 1.0), st.floats(0.0, 100.0), st.floats(0.1, 100.0))
+@settings(max_examples=50)
+def test_forces_rise_with_the_rise_and_without_jumps(
+    rise: float, more: float, std_share: float, largest_n: float
+) -> None:
+    known = replace(calibration(), largest_force_n=largest_n)
+    rises = rise * np.array([1.0, 1.0 + 1e-9, 1.0 + more])[:, None, None] * np.ones((3, 2, 3))
+    plain, _ = known.model.predict(rises, std_share * rises)
+    found, std = known.forces(rises, std_share * rises, np.full((3, 2, 3), True))
+    assert (found <= plain * (1 + 1e-12)).all()
+    assert (found[2] >= found[0] * (1 - 1e-3)).all()
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-3)
+    assert (np.isfinite(std) & (std > 0)).all()
 
 
 def test_a_certain_force_beyond_those_of_the_presses_stays() -> None:

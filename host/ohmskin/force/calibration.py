@@ -236,21 +236,15 @@ class Calibration:
 
         rise, rise_std: above rest, (..., R, C) [S; 1 for `voltage`]; touched: which cells are.
 
-        They are `model.predict`, F with deviation s. But where s of a touched cell is large,
-        readings may allow any hard touch. Then a force q is as probable as others up to the largest
-        force L of the presses, and above L by (L / q)^2: twice as hard as ever pressed is a quarter
-        as probable. The force is the mean of what this leaves of a normal,
+        They are `model.predict`, F with deviation s. But if s of a touched cell is large, readings
+        may allow any hard touch. Then a force q is as probable as others up to the largest force L
+        of the presses, and above L by (L / q)^3: twice as hard as ever pressed is an eighth as
+        probable. Errors upwards reach F + 4 s in four deviations (`Estimate`), and downwards not
+        as far, as if those of log F were normal, with deviation w:
 
-            p(q) ~ exp(-(q - F)^2 / (2 s'^2)) min(1, (L / q)^2) ,   q > 0 ,   s' = min(s, L) ,
+            p(log q) ~ exp(-log(q / F)^2 / (2 w^2)) min(1, (L / q)^3) ,   w = log(1 + 4 s / F) / 4 .
 
-        where that is below F. Its deviation: F + 4 s is a limit of errors upwards that are four
-        deviations large (`Estimate`). Errors are normal in the resistance of a cell, so those of z
-        deviations lead to
-
-            q_z = F (F + 4 s) / (F + 4 s - z s) ,
-
-        and the deviation is that of all q_z about the force that is given, weighed by
-        exp(-z^2 / 2) min(1, (L / q_z)^2). It is less than s, and 0 only where F is.
+        The force is exp(mean of log q), and its deviation that of q about it.
 
         Raises ValueError as `predict` does.
         """
@@ -285,19 +279,13 @@ class Calibration:
 
 def _likely(force_n: Float, std_n: Float, largest_n: float) -> tuple[Float, Float]:
     """`Calibration.forces` of n touched cells, each (n,), by sums over q."""
-    F, s, z = force_n[:, None], std_n[:, None], _OPEN_STDS
-
-    def shares(q: Float) -> Float:
-        prior = (q > 0) * np.minimum(largest_n / np.maximum(q, largest_n), 1.0) ** 2
-        share = prior * np.exp(-0.5 * z**2)
-        return np.asarray(share / share.sum(axis=1, keepdims=True))
-
-    q = F + np.minimum(s, largest_n) * z
-    likely_n = np.minimum((shares(q) * q).sum(axis=1), force_n)
-    limit = F + z[-1] * s
-    q = F * limit / (limit - z * s)
-    square = (shares(q) * (q - likely_n[:, None]) ** 2).sum(axis=1)
-    return likely_n, np.sqrt(square)
+    log_std = np.log1p(_OPEN_STDS[-1] * std_n / force_n) / _OPEN_STDS[-1]
+    q = force_n[:, None] * np.exp(log_std[:, None] * _OPEN_STDS)
+    prior = np.minimum(largest_n / np.maximum(q, largest_n), 1.0) ** 3
+    share = prior * np.exp(-0.5 * _OPEN_STDS**2)
+    share /= share.sum(axis=1, keepdims=True)
+    likely_n = force_n * np.exp(log_std * (share @ _OPEN_STDS))
+    return likely_n, np.sqrt((share * (q - likely_n[:, None]) ** 2).sum(axis=1))
 
 
 def _null(array: Float) -> NDArray[Any]:
