@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,6 +135,32 @@ def test_what_the_other_kind_of_skin_has_is_said_where_it_is_asked_for() -> None
         for of in (skin, device):
             with pytest.raises(AttributeError, match=r"object has no attribute 'nothing'$"):
                 of.nothing  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_an_attribute_that_fails_says_why() -> None:
+    """It was said that there is none, and to give a calibration, or to ask the device."""
+
+    class OwnScan(ForceScan):
+        @property
+        def ratio(self) -> Any:
+            return self.codes.nothing  # type: ignore[attr-defined]
+
+        wrench = ratio
+
+    class OwnSkin(CalibratedSkin):
+        @property
+        def info(self) -> Any:
+            return self.device.nothing  # type: ignore[attr-defined]
+
+    with OwnSkin(device := stepped(GHOST), of_scene("ghost")) as skin:
+        scan = OwnScan(**vars(skin.latest()))
+        for of, name, inner in (
+            (scan, "ratio", "numpy.ndarray"),
+            (scan, "wrench", "numpy.ndarray"),
+            (skin, "info", type(device).__name__),
+        ):
+            with pytest.raises(AttributeError, match=f"'{inner}' .* no attribute 'nothing'$"):
+                getattr(of, name)
 
 
 def test_a_tare_says_the_mode_of_the_board() -> None:

@@ -465,10 +465,10 @@ class CalibratedSkin(Closing):
     if not TYPE_CHECKING:  # a type checker would take any name for an attribute
 
         def __getattr__(self, name: str) -> object:
-            text = f"'{type(self).__name__}' object has no attribute '{name}'"
-            if hasattr(Device, name):
-                text += f": its device has: skin.device.{name}"
-            raise AttributeError(text, name=name, obj=self)
+            if not hasattr(Device, name) or hasattr(type(self), name):
+                return super().__getattribute__(name)  # raises, with a property's own error
+            text = f"'{type(self).__name__}' object has no attribute '{name}': its device has: "
+            raise AttributeError(f"{text}skin.device.{name}", name=name, obj=self)
 
     @property
     def info(self) -> Hello:

@@ -130,10 +130,10 @@ class Device(Closing):
     if not TYPE_CHECKING:  # a type checker would take any name for an attribute
 
         def __getattr__(self, name: str) -> object:
-            text = f"'{type(self).__name__}' object has no attribute '{name}'"
-            if name in ("calibration", "tare", "undo_tare"):
-                text += ": skins have it where a calibration is given: "
-                text += "ohmskin.open(port, calibration='skin.json')"
+            if name not in ("calibration", "tare", "undo_tare") or hasattr(type(self), name):
+                return super().__getattribute__(name)  # raises, with a property's own error
+            text = f"'{type(self).__name__}' object has no attribute '{name}': skins have it "
+            text += "where a calibration is given: ohmskin.open(port, calibration='skin.json')"
             raise AttributeError(text, name=name, obj=self)
 
     @property

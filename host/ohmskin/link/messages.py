@@ -228,10 +228,10 @@ class Scan:
     if not TYPE_CHECKING:  # a type checker would take any name for an attribute
 
         def __getattr__(self, name: str) -> Any:
-            text = f"'{type(self).__name__}' object has no attribute '{name}'"
-            if name in _OF_FORCES:
-                text += ": scans have it where a calibration is given: "
-                text += "ohmskin.open(port, calibration='skin.json')"
+            if name not in _OF_FORCES or hasattr(type(self), name):
+                return super().__getattribute__(name)  # raises, with a property's own error
+            text = f"'{type(self).__name__}' object has no attribute '{name}': scans have it "
+            text += "where a calibration is given: ohmskin.open(port, calibration='skin.json')"
             raise AttributeError(text, name=name, obj=self)
 
     def __repr__(self) -> str:
