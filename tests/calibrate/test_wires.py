@@ -118,6 +118,21 @@ def test_wires_that_were_told_in_another_unit_count_for_nothing(factor: float) -
     assert found.wires.both == pytest.approx(untold.wires.both, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("told", "kept"),
+    [
+        (WireOhm(None, 2.0), WireOhm()),
+        (WireOhm(1.0, 2.0, 300.0, None, None, 300.0), WireOhm(lead=300.0, lead_std_ohm=300.0)),
+    ],
+    ids=["one layer", "lead"],
+)
+def test_what_counts_for_nothing_are_layers_alone(told: WireOhm, kept: WireOhm) -> None:
+    """A wrong layer held the other one's place; and a lead of 300 +- 300 ohm was kept as exact."""
+    of, cells = skin((4, 4), 100.0, 200.0, 600.0), list(range(16))
+    found, expected = (found_by(of, each, cells, 0.2).wires for each in (told, kept))
+    assert list(found[:6]) == pytest.approx(list(expected[:6]), rel=1e-3)
+
+
 def test_readings_under_weights_tell_the_wires() -> None:
     """Three weights twice on every cell: conductances that were read without knowing the wires."""
     of, law, random = skin((5, 4), 300.0, 600.0), [], np.random.default_rng(4)

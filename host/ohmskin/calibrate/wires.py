@@ -209,8 +209,9 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     rest = PortReader(knowledge).read(knowledge.rest_ratio)
     rows = _rows(readings, rest.current.ravel())
     told, fits = knowledge.nominal_wire_ohm, [(0.0, knowledge)]
-    if told.both is not None:
-        untold = replace(knowledge, nominal_wire_ohm=WireOhm(lead=told.lead))
+    if told[:2] != (None, None):
+        of_lead = WireOhm(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
+        untold = replace(knowledge, nominal_wire_ohm=of_lead)
         fits.append((-2 * np.log(WRONGLY_TOLD), untold))
     tried = []
     for cost, known in fits:
