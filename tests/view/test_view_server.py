@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import socket
+import sys
 from contextlib import suppress
 from pathlib import Path
 from unittest.mock import AsyncMock, Mock
@@ -17,11 +18,14 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from command_line import Command, Done, Run, assert_one_line, finish, python
+from ohmskin.cli.view import view
+from ohmskin.errors import PortError
 from ohmskin.view import server
 from ohmskin.view.boards import ViewedBoards
 from ohmskin.view.panel import Panel
 from ohmskin.view.server import make_app
 from viewed import GHOST, HOST, ORIGIN, REST, TOKEN, Page, panel, served
+from waiting import until
 
 PAGE = Path(server.__file__).parent / "page"
 
@@ -201,6 +205,21 @@ def test_a_board_that_is_not_there_is_told_of_in_the_terminal(command: Command) 
     done = finish(process)
     text = "ohmskin: no port /dev/nothing: 'ohmskin ports' lists the ports there are\n"
     assert (said, done) == (text, Done(0, "", ""))
+
+
+def test_boards_are_read_though_nobody_reads_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in 'ohmskin view 2>&1 | head -1': a line that could not be written ended the thread."""
+
+    def serve(boards: ViewedBoards, *_: object) -> None:
+        (board,) = boards.values()
+        until(lambda: closed.write.called and board.failure)
+        assert isinstance(board.failure, PortError)
+        boards.close()
+
+    monkeypatch.setattr(server, "serve", serve)
+    closed = Mock(write=Mock(side_effect=BrokenPipeError))
+    monkeypatch.setattr(sys, "stderr", closed)
+    view(["/dev/nothing"])
 
 
 def test_ctrl_c_counts_from_the_moment_the_address_is_known() -> None:

@@ -7,7 +7,7 @@ import sys
 import threading
 import webbrowser
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, TextIO
 
 from typer import Argument, Option
 
@@ -70,10 +70,12 @@ def view(
         LOG.removeHandler(told)
 
 
-class _Told(logging.Handler):
-    """Prints what the log says of boards: whoever looks at the terminal may not see the page."""
+class _Told(logging.StreamHandler[TextIO]):
+    """Prints what the log says of boards: whoever looks at the terminal may not see the page.
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """A line on stderr."""
-        text = " ".join(record.getMessage().split())
-        print(printable(f"ohmskin: {text}"), file=sys.stderr, flush=True)  # noqa: T201
+    If stderr was closed, it goes on without: a failure would end the thread that reads the board.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        """A line."""
+        return printable(f"ohmskin: {' '.join(record.getMessage().split())}")
