@@ -27,9 +27,10 @@ changes, these two differ, and cells differ by unlike amounts. Then the frame co
     e = sum w median(x) / (sum w + 1 / s_e^2) ,
     1 / w = pi / 2 (median |x - median(x)| / 0.6745)^2 / cells + (median |d|)^2 ,
 
-with s_e the deviation of e before any such frame (`EXCESS_STD_RATIO`). The sums forget as those of
-`port_mirror` do. Only cells with h above 1/2 count, and only frames with enough of them, whose
-median is within `_MOST_EXCESS_STDS` s_e.
+with s_e the deviation of e before any such frame (`EXCESS_STD_RATIO`), and the first square at
+least that of the deviation of rounding. The sums forget as those of `port_mirror` do. Only cells
+with h above 1/2 count, and only frames with enough of them, whose median is within
+`_MOST_EXCESS_STDS` s_e.
 """
 
 from typing import Final
