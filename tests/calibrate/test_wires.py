@@ -118,6 +118,19 @@ def test_wires_that_were_told_in_another_unit_count_for_nothing(factor: float) -
     assert found.wires.both == pytest.approx(untold.wires.both, rel=1e-3)
 
 
+@pytest.mark.parametrize(("cells", "factor"), [([0, 1, 2, 3], 2.5), ([0, 4, 8, 12], 3.0)])
+def test_layers_that_presses_do_not_tell_are_no_evidence(cells: list[int], factor: float) -> None:
+    """Cells of one line tell one layer, and it was told wrongly.
+
+    That the other one may be anything, if nothing was told, makes that no less probable.
+    """
+    told = WireOhm(factor * 100.0, factor * 200.0)
+    found, untold = (
+        found_by(skin((4, 4), 100.0, 200.0), each, cells, 0.2).wires for each in (told, WireOhm())
+    )
+    assert found.both == pytest.approx(untold.both, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("told", "kept"),
     [

@@ -44,8 +44,8 @@ N is the noise of the readings, * multiplies by elements, and [...] is 1 where i
 The fit minimises (y - y(p))^T C^-1 (y - y(p)) and the priors of p. Between such fits, the variances
 v are replaced by the most likely ones. Two leads and r lie in series, so presses tell their sum
 alone, and the prior of r divides it: what is above the usual r is taken for the leads. The
-covariance of p is that of least squares. Wires that were told are tried as told and as never told,
-and the more probable one of both is the answer (`WRONGLY_TOLD`).
+covariance of p is that of least squares. Layers that were told are tried as told and as never told,
+the leads as told, and the more probable one of both is the answer (`WRONGLY_TOLD`).
 """
 
 from dataclasses import dataclass, replace
