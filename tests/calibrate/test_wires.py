@@ -142,8 +142,9 @@ def test_layers_that_presses_do_not_tell_are_no_evidence(cells: list[int], facto
 def test_what_counts_for_nothing_are_layers_alone(told: WireOhm, kept: WireOhm) -> None:
     """A wrong layer held the other one's place; and a lead of 300 +- 300 ohm was kept as exact."""
     of, cells = skin((4, 4), 100.0, 200.0, 600.0), list(range(16))
-    found, expected = (found_by(of, each, cells, 0.2).wires for each in (told, kept))
-    assert list(found[:6]) == pytest.approx(list(expected[:6]), rel=1e-3)
+    found, expected = (found_by(of, each, cells, 0.2) for each in (told, kept))
+    assert list(found.wires[:6]) == pytest.approx(list(expected.wires[:6]), rel=1e-3)
+    assert (found.disagrees, expected.disagrees) == (True, False)
 
 
 def test_readings_under_weights_tell_the_wires() -> None:

@@ -162,13 +162,13 @@ class FoundWires:
 
     @property
     def disagrees(self) -> bool:
-        """Whether wires were told and others are found, by more than skins stretch."""
-        found = self.wires
-        if self.told.both is None or found.both is None:
-            return False
-        off = np.log(np.array(found.both) / np.maximum(self.told.both, 1e-3))
-        stds = np.array([found.top_log_std or 0.0, found.bottom_log_std or 0.0])
-        return bool((np.abs(off) > np.maximum(LAYER_STD, REACH_STDS * stds)).any())
+        """Whether a layer was told and other wires are found, by more than skins stretch."""
+        layers = zip(self.told[:2], self.wires[:2], self.wires[3:5], strict=True)
+        return any(
+            abs(np.log(ohm / max(told, 1e-3))) > max(LAYER_STD, REACH_STDS * (std or 0.0))
+            for told, ohm, std in layers
+            if told is not None and ohm is not None
+        )
 
 
 class _Rows(NamedTuple):
