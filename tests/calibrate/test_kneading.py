@@ -413,6 +413,7 @@ def test_the_power_law_of_a_curve_that_bends_is_right_where_forces_are_large() -
     found_n = [model.predict(np.full((3, 4), x), np.zeros((3, 4)))[0][0, 0] for x in rise_at]
     assert found_n[2] == pytest.approx(4.0, rel=0.05)
     assert found_n == pytest.approx(at_n, rel=0.1)
+    assert fit.largest_n == pytest.approx(shown_n.max(), rel=0.1)  # of a press, not of a cell
 
 
 def kneaded_behind_wires() -> tuple[Totals, WireSlopes]:

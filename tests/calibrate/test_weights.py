@@ -122,7 +122,7 @@ def test_weights_are_asked_for_read_and_learned(weigh: Run, tmp_path: Path) -> N
     done = well(weigh(putting(ASKED[4:]), *OPTIONS))
     assert done.out.splitlines()[4] == "put 200 g (1.961 N) on cell (0, 1), row 0, column 1"
     assert "held-out error" in done.out
-    assert f"{out}: calibration of unit 7, by forces up to 9.81 N on a cell" in done.out
+    assert f"{out}: calibration of unit 7, by presses up to 9.81 N" in done.out
     assert pairs_of(table) == ASKED
 
     rest = REST.cell_siemens

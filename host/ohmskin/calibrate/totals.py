@@ -190,7 +190,7 @@ class TotalFit:
     """The fit of the module's equations.
 
     scale: the scale's filter; None: it is found. After `fit`: `scale_`; `covariance_` of k, b, c,
-    h, v, w, g, e, z and the delay.
+    h, v, w, g, e, z and the delay; `largest_n`, the largest force of all cells together [N].
     """
 
     def __init__(
@@ -420,7 +420,9 @@ class TotalFit:
         self._trust = np.where(self._is_press, trust, 1.0)
         least_n = np.maximum(LEAST_OFF_N, LEAST_OFF * force_n)
         self._out = (stds > OUTLIER_STDS) & (off > least_n)
-        self.largest_n = float(self._parts(self._contact()[0]).max())
+        parts = self._parts(self._contact()[0])
+        self.largest_n = float(parts.sum(axis=1).max())
+        self._largest_part_n = float(parts.max())
         gains = self._of_gains
         square = np.sum(self._p[gains] ** 2 + self.covariance_.diagonal()[gains])
         cells = GAIN_CELLS + self._totals.rise.shape[1]
@@ -482,7 +484,7 @@ class TotalFit:
             exponent=exponent.clip(MIN_EXPONENT, MAX_EXPONENT).reshape(shape),
             exponent_std=np.sqrt(exponent_var).reshape(shape),
             correlation=(both / np.sqrt(slope_var * exponent_var)).clip(-1, 1).reshape(shape),
-            residual_std=0.1 * share * self.largest_n * every,
+            residual_std=0.1 * share * self._largest_part_n * every,
             residual_share=share * every,
             pooled=(self.gain_std() > POOLED_SHARE * self._gain_std).reshape(shape),
             held_out_rmse=np.nan * every,

@@ -497,7 +497,7 @@ def _conclude(calibration: Calibration, calibrator: Calibrator, out: Path) -> No
     """Say what was written. The largest force shows it if a sensor's newtons are none."""
     TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator))
     of = f"{out}: calibration of unit {calibration.unit_id}"
-    TERMINAL.print(f"{of}, by forces up to {calibration.largest_force_n:.3g} N on a cell")
+    TERMINAL.print(f"{of}, by presses up to {calibration.largest_force_n:.3g} N")
 
 
 def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:

@@ -29,7 +29,8 @@ rest.ratio               R, C, 4           readings of the untouched skin before
 rest.level               R, C              conductance at rest [S]; `voltage`: `voltage_level` [1]
 tare                                       the same of a later date, used in place of rest; null:
                                            there is none
-largest_force_n                            of the presses [N]; absent or null: not known
+largest_force_n                            of the presses, of all cells together [N]; absent or
+                                           null: not known
 geometry                                   where the cells are: kind, frame_id, and what `geometry`
                                            says of this kind; absent or null: not known
 kind                     R, C              "linear" or "power"
