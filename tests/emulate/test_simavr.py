@@ -178,8 +178,6 @@ def test_a_board_whose_converter_is_late_says_so_when_no_scan_comes() -> None:
     """A silent board is asked for its hello, whose counter the host says in words."""
     with ohmskin.open("simavr://uno?late_cycles=60") as skin:
         skin.configure(rate_hz=0, settle_us=1)
-        with pytest.raises(
-            DeviceLost, match=r"no scan for 3\.0 s: \d+ conversions late: ask for a"
-        ):
+        with pytest.raises(DeviceLost, match=r"no scan for 3 s: \d+ conversions late: ask for a"):
             skin.latest(3.0)
         assert skin.info.late > 1000

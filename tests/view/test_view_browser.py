@@ -44,7 +44,10 @@ def serving(folder: Path, *arguments: str) -> Iterator[Server]:
         try:
             yield Server(folder, process.stdout.readline().strip())
             process.send_signal(signal.SIGINT)
-            assert finish(process) == Done(0, "", "")
+            done = finish(process)
+            assert done == Done(0, "", done.err)
+            # Only of boards that tests pulled out.
+            assert all("is gone: is the board still" in line for line in done.err.splitlines())
         finally:
             process.kill()
 

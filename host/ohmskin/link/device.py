@@ -211,13 +211,12 @@ class Device(Closing):
         patience_s = SILENCE_TIMEOUT_S + 2 / self.info.rate_hz
         limit_s = patience_s if limit_s is None else limit_s
         if not self._wait(ready, limit_s):
-            if limit_s < patience_s:  # so short a silence is no sign of a board that is gone
-                text = f"{self.name} has sent no scan for {limit_s:.2g} s"
-                raise DeviceLost(text, "wait for longer: a larger timeout_s, or none")
+            silent = f"{self.name} has sent no scan for {limit_s:.2g} s"
             # A silent board has been asked for its hello. After a reset, it counts from 0 again.
             if (late := self.info.late) not in (0, self._late_before):
-                silent = f"{self.name} has sent no scan for {limit_s:.1f} s"
                 raise DeviceLost(f"{silent}: {late} conversions late", "ask for a lower rate")
+            if not limit_s >= patience_s:  # so short a silence is no sign of a board that is gone
+                raise DeviceLost(silent, "wait for longer: a larger timeout_s, or none")
             silent = f"{self.name} has said nothing for {limit_s:.1f} s"
             raise DeviceLost(f"{silent}: unplug and plug it")
         self._changed.notify_all()  # a replay may go on
