@@ -5,7 +5,7 @@ That circuit is compared with ngspice in tests/circuit.
 """
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -19,9 +19,7 @@ from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import NO_WIRES
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.estimate.port_readings import PortReadings
-from ohmskin.estimate.prior import SEGMENT_STD, CellPrior
-from ohmskin.estimate.wire_belief import WireBelief
+from ohmskin.estimate.prior import SEGMENT_STD
 from studies.trials import Trial, finger_trial, random_trial, skin_at_rest, trial_of
 
 METHODS = ("joint", "touch")
@@ -172,15 +170,9 @@ class KeptFit(FullFit):
 
     made: ClassVar[list["KeptFit"]] = []
 
-    def __init__(
-        self,
-        prior: CellPrior,
-        belief: WireBelief,
-        ref_ohm: float,
-        ports: PortReadings,
-        start: Float,
-    ) -> None:
-        super().__init__(prior, belief, ref_ohm, ports, start)
+    def __init__(self, *made_of: Any) -> None:
+        super().__init__(*made_of)
+        _prior, belief, _ref_ohm, ports, _start = made_of
         self.ports, self.expected_means = ports, belief.means
         self.precision = np.linalg.inv(belief._state.covariance)
         KeptFit.made.append(self)
