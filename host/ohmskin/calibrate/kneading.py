@@ -105,6 +105,15 @@ class _Levels(NamedTuple):
     estimator: Estimator
 
 
+class _Trial(NamedTuple):
+    """A trial of the wires: w, the wires after it, the fit, and how far its sums are off."""
+
+    held: Float
+    wires: WireOhm
+    fit: TotalFit
+    share: float
+
+
 class Kneading:
     """Scans of presses anywhere, by which a calibrator learns.
 
@@ -191,24 +200,33 @@ class Kneading:
         w, scale = centre, None
         if told.both is None:
             w = np.minimum(w, np.log(START_OHM))
-        used, is_first = self._in_stretches(FIRST_CELLS), True
+        used, is_first, best = self._in_stretches(FIRST_CELLS), True, None
         for _ in range(TRIALS):
             top_ohm, bottom_ohm = np.exp(w).tolist()
             wires = _held(WireOhm(top_ohm, bottom_ohm, lead_ohm, lead_std_ohm=lead_std_ohm))
             levels = self._levels(DEFAULT_METHOD, wires, used)
             wires = levels.estimator.wires()
-            lead_ohm = wires.lead or 0.0
             prior = WireSlopes(self._slopes(wires, levels), centre - w, std)
             fit = TotalFit(self._totals(levels, log), prior, scale).fit()
-            scale = fit.scale_
+            share = fit.residual_share()
+            if best is not None and share > best.share:  # the step from there was too long
+                w = 0.5 * (best.held + w)
+                if np.abs(w - best.held).max() < LAST_STEP:
+                    break
+                continue
             step, covariance = fit.w
             stds = np.sqrt(covariance.diagonal())
-            held, w = w, w + step.clip(-LONGEST_STEP, LONGEST_STEP)
+            best = _Trial(w, wires, fit, share)
+            lead_ohm, scale = wires.lead or 0.0, fit.scale_
+            w = w + step.clip(-LONGEST_STEP, LONGEST_STEP)
             if is_first and (np.abs(step) < np.maximum(SHORT_STEP, stds)).all():
-                used, is_first = self._in_stretches(TRIAL_CELLS), False
+                # Errors of other scans are not to be compared with these.
+                used, is_first, best = self._in_stretches(TRIAL_CELLS), False, None
             elif (np.abs(step) < np.maximum(LAST_STEP, CLOSE_STDS * stds)).all():
                 break
-        w, stds = likely_wires(held, step, covariance, centre, std)
+        best = best or _Trial(w, wires, fit, share)
+        wires, fit = best.wires, best.fit
+        w, stds = likely_wires(best.held, *fit.w, centre, std)
         (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(w).tolist(), stds.tolist()
         lead_std = wires.lead_std_ohm
         found = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std)

@@ -302,7 +302,7 @@ class TotalFit:
                 self._fit_scale()
             self._step()
             self._judge(trims=number >= ROBUST_ROUNDS)
-        if not self._residual_share() < MOST_SHARE:
+        if not self.residual_share() < MOST_SHARE:
             raise ValueError(STRANGE)
         return self
 
@@ -475,7 +475,7 @@ class TotalFit:
         log_slope, exponent = of_law @ p[chosen].T
         covariance = self.covariance_[chosen[:, :, None], chosen[:, None, :]]
         (slope_var, both), (_, exponent_var) = np.moveaxis(of_law @ covariance @ of_law.T, 0, -1)
-        share, slope = self._residual_share(), np.exp(log_slope)
+        share, slope = self.residual_share(), np.exp(log_slope)
         every = np.ones(shape)
         return ForceModel(
             kind=np.full(shape, POWER),
@@ -501,7 +501,7 @@ class TotalFit:
         steeper, level = np.polyfit(np.log(x / self._unit), log_contact, 1, w=force)
         return float(level), float(steeper)
 
-    def _residual_share(self) -> float:
+    def residual_share(self) -> float:
         """s1 of each cell, from how far sums are off."""
         parts = self._parts(self._contact()[0])
         root = np.sqrt((parts**2).sum(axis=1))[:, None]
