@@ -24,7 +24,7 @@ from ohmskin.calibrate.sessions import joined
 from ohmskin.calibrate.tables import ForceLog
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.estimate.base import Estimator
-from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan
@@ -369,6 +369,31 @@ def test_a_skin_that_was_kneaded_reads_forces(
     forces = skin.read(out)
     assert forces.rmse_n() < 0.6
     assert forces.within_percent() > 97
+
+
+def test_steps_of_the_wires_that_are_too_long_are_halved(
+    skin: KneadedSkin, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where presses told little of the wires, one step led to 1.4 kohm, and to no way back.
+
+    Here each step is a factor of e, and sums are farther off the farther the wires are from 100.
+    """
+    recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
+    skin.record_kneading(recording)
+    tried: list[float] = []
+    levels = Kneading._levels
+
+    def spied(self: Kneading, method: str, wires: WireOhm, *given: Any) -> Any:
+        tried.append(wires.top or 0.0)
+        return levels(self, method, wires, *given)
+
+    monkeypatch.setattr(Kneading, "_levels", spied)
+    monkeypatch.setattr(TotalFit, "w", (np.array([1.0, 1.0]), 0.01 * np.eye(2)))
+    monkeypatch.setattr(TotalFit, "residual_share", lambda fit: abs(np.log(tried[-1] / 100)) / 9)
+    learned(run, recording, out)
+    logs = np.log(np.array(tried[:-1]) / 50)  # the last one is of the reading after the trials
+    assert logs[:6].tolist() == pytest.approx([0, 1, 2, 1.5, 1.25, 1.125])
+    assert logs.size == 6
 
 
 def test_a_rest_that_has_moved_between_recordings_is_no_force(
