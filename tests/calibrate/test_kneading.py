@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import solve_ivp
 
 from command_line import Run, assert_one_line, well
 from kneaded_skin import KneadedSkin
 from kneaded_skin import Scale as ScaleBelow
 from ohmskin.arrays import Float
 from ohmskin.calibrate import kneading
-from ohmskin.calibrate.kneading import Kneading, likely_wires
+from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.scale import Scale, fit_scale, printed_s, wrong_numbers
 from ohmskin.calibrate.sessions import joined
 from ohmskin.calibrate.tables import ForceLog
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.estimate.base import Estimator
-from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.calibration import load_calibration
 from ohmskin.link.messages import Scan
@@ -371,31 +371,6 @@ def test_a_skin_that_was_kneaded_reads_forces(
     assert forces.within_percent() > 97
 
 
-def test_steps_of_the_wires_that_are_too_long_are_halved(
-    skin: KneadedSkin, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where presses told little of the wires, one step led to 1.4 kohm, and to no way back.
-
-    Here each step is a factor of e, and sums are farther off the farther the wires are from 100.
-    """
-    recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
-    skin.record_kneading(recording)
-    tried: list[float] = []
-    levels = Kneading._levels
-
-    def spied(self: Kneading, method: str, wires: WireOhm, *given: Any) -> Any:
-        tried.append(wires.top or 0.0)
-        return levels(self, method, wires, *given)
-
-    monkeypatch.setattr(Kneading, "_levels", spied)
-    monkeypatch.setattr(TotalFit, "w", (np.array([1.0, 1.0]), 0.01 * np.eye(2)))
-    monkeypatch.setattr(TotalFit, "residual_share", lambda fit: abs(np.log(tried[-1] / 100)) / 9)
-    learned(run, recording, out)
-    logs = np.log(np.array(tried[:-1]) / 50)  # the last one is of the reading after the trials
-    assert logs[:6].tolist() == pytest.approx([0, 1, 2, 1.5, 1.25, 1.125])
-    assert logs.size == 6
-
-
 def test_a_rest_that_has_moved_between_recordings_is_no_force(
     skin: KneadedSkin, tmp_path: Path
 ) -> None:
@@ -461,48 +436,22 @@ def kneaded_behind_wires() -> tuple[Totals, WireSlopes]:
 
 
 def test_hysteresis_and_unseen_force_are_not_taken_for_wires() -> None:
-    found = TotalFit(*kneaded_behind_wires()).fit()
-    assert np.abs(found.w[0]).max() < 0.35
+    totals, slopes = kneaded_behind_wires()
+    found = TotalFit(totals, for_wires=True).fit()
+    assert np.abs(found.wires(slopes)[0]).max() < 0.35
     assert abs(found.scale_.lag_s) < 2e-3
 
 
 def test_few_presses_that_are_estimated_wrong_are_not_taken_for_wires() -> None:
     """Two of 240 made the logs of the wires 3 too large, and were no outliers then."""
     totals, slopes = kneaded_behind_wires()
-    usual = TotalFit(totals, slopes).fit().w[0]
+    usual = TotalFit(totals, for_wires=True).fit().wires(slopes)[0]
     hardest = [totals.rise[totals.press == n].sum(axis=1).max() for n in range(240)]
     wrong = np.isin(totals.press, np.argsort(hardest)[-2:])
     rise = totals.rise * np.where(wrong, 1.2, 1.0)[:, None]
-    fit = TotalFit(totals._replace(rise=rise), slopes).fit()
+    fit = TotalFit(totals._replace(rise=rise), for_wires=True).fit()
     assert fit.presses_left_out == 0
-    assert np.abs(fit.w[0] - usual).max() < 0.2
-
-
-@pytest.mark.parametrize(("ohm", "std_ohm"), [(100.0, 5.0), (500.0, 250.0), (200.0, 400.0)])
-def test_wires_are_a_mean_of_what_presses_do_not_exclude(ohm: float, std_ohm: float) -> None:
-    """Two layers of which presses tell this in ohms, and whose logs were expected about 150 ohm."""
-    held, centre, std = np.log(180.0), np.log(150.0), 1.5
-    precision = (180.0 / std_ohm) ** 2  # of the share by which a segment differs from that
-    covariance = 1 / (precision + std**-2)
-    step = covariance * (precision * (ohm / 180.0 - 1) + (centre - held) / std**2)
-    alike = np.ones(2)
-    mean, deviation = likely_wires(
-        held * alike, step * alike, covariance * np.eye(2), centre * alike, std * alike
-    )
-
-    def density(log_ohm: float) -> float:
-        return float(
-            np.exp(-0.5 * ((np.exp(log_ohm) - ohm) / std_ohm) ** 2)
-            * np.exp(-0.5 * ((log_ohm - centre) / std) ** 2)
-        )
-
-    powers = [
-        quad(lambda log_ohm, n=n: density(log_ohm) * log_ohm**n, -3, 10, points=[4, 5, 6])[0]
-        for n in range(3)
-    ]
-    expected = powers[1] / powers[0]
-    assert mean == pytest.approx(expected, abs=0.02)
-    assert deviation == pytest.approx(np.sqrt(powers[2] / powers[0] - expected**2), rel=0.05)
+    assert np.abs(fit.wires(slopes)[0] - usual).max() < 0.2
 
 
 def test_total_and_an_indenter_exclude_each_other(run: Run, tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_a_skin_is_kneaded_until_every_cell_is_known(run: Run, tmp_path: Path) -
     done = well(run("calibrate", "knead", f"{SKIN}&scene=knead", str(out), *TRUTH))
     lines = done.out.splitlines()
     assert lines[0].startswith("touch nothing for 2 s, then press everywhere")
-    assert re.fullmatch(r"10 s: \d of 6 cells are known to 15 %, press at row .*", lines[1])
+    assert re.fullmatch(r"10 s: \d of 6 cells are known to 15 %, the wires need .*", lines[1])
     assert "6 of 6 cells are known to 15 %" in done.out
     assert f"{out}: calibration of unit 0" in lines[-1]
     recording = load_recording(tmp_path / "skin.knead-1.mcap")
@@ -73,22 +73,22 @@ def test_a_skin_is_kneaded_until_every_cell_is_known(run: Run, tmp_path: Path) -
 def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "skin.json"
     command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3", str(out), *TRUTH)
-    done = well(run(*command, "--seconds", "11"))
+    done = well(run(*command, "--seconds", "7"))
     assert "not all cells are known yet: the same command goes on" in done.out
     known = [int(n) for n in re.findall(r"(\d+) of 6 cells are known", done.out)]
     first = load_calibration(out)
-    done = well(run(*command, "--seconds", "11"))
+    done = well(run(*command, "--seconds", "7"))
     now = [int(n) for n in re.findall(r"(\d+) of 6 cells are known", done.out)]
     assert known[-1] < now[-1]
     assert len(list(tmp_path.glob("skin.knead-*.mcap"))) == 2
-    assert load_calibration(out).model.slope_std.max() < first.model.slope_std.max()
+    assert load_calibration(out).model.slope_std.mean() < first.model.slope_std.mean()
 
 
 def test_a_touch_at_the_rest_of_an_older_recording_is_named(run: Run, tmp_path: Path) -> None:
     """The newest rest alone was looked at, and the older recording taught what it could not."""
     out, path = tmp_path / "skin.json", tmp_path / "skin.knead-1.mcap"
     command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3", str(out), *TRUTH)
-    well(run(*command, "--seconds", "11"))
+    well(run(*command, "--seconds", "9"))
     given = load_recording(path)
     pressed_s = max(given.forces, key=lambda force: force.force_n).host_time_s
     pressed = next(scan for scan in given.scans if scan.host_time_s >= pressed_s)
@@ -101,7 +101,7 @@ def test_a_touch_at_the_rest_of_an_older_recording_is_named(run: Run, tmp_path: 
     done = run(*command, "--seconds", "11")
     assert_one_line(done._replace(out=""), "skin.knead-1.mcap: ", "touched at rest: move it away")
     assert out.read_bytes() == before
-    well(run(*command, "--seconds", "3", "--force"))
+    well(run(*command, "--seconds", "9", "--force"))
 
 
 def test_a_press_that_is_left_out_is_named_by_its_recording(run: Run, tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_a_press_that_is_left_out_is_named_by_its_recording(run: Run, tmp_path: 
     out = tmp_path / "skin.json"
     command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3", str(out), *TRUTH)
     for _ in range(2):
-        well(run(*command, "--seconds", "11"))
+        well(run(*command, "--seconds", "9"))
     path = tmp_path / "skin.knead-2.mcap"
     given = load_recording(path)
     begin_s = given.scans[0].host_time_s
@@ -160,7 +160,7 @@ def test_an_early_ctrl_c_is_no_error_and_kneading_goes_on(
     # A rest that was cut off would be that of all recordings.
     assert (tmp_path / "skin.knead-1.mcap").exists() == (ends != 20)
     assert "--rest" not in done.out
-    well(run(*command, "--seconds", "11"))
+    well(run(*command, "--seconds", "9"))
     assert out.exists()
 
 

@@ -54,12 +54,12 @@ CONTACT_STD: Final = 0.08
 # the lag of its filter.
 SCALE_STD_N: Final = 0.05
 # A number that comes sooner after the last one tells nothing new [s]. Chosen: the noise of a
-# contact lasts as long, and most scales show ten numbers a second.
-NEWS_S: Final = 0.1
-# No cell counts as known before the scale has shown so many numbers for each cell of the skin.
-# Chosen: those of one or two presses a cell. The curve of all cells and the wires, which are not in
-# t, need them.
-NUMBERS_A_CELL: Final = 10
+# contact lasts about as long, and most scales show ten numbers a second, which come a little sooner
+# or later.
+NEWS_S: Final = 0.08
+# A skin is known when the scale has shown so many numbers for each of its cells. Chosen: those of
+# one or two presses a cell. The curve of all cells and the wires, which are not in t, need them.
+NUMBERS_A_CELL: Final = 8
 # A smaller force is not counted [N]. Chosen: the error of a scale's zero is a large share of it.
 LEAST_N: Final = 0.3
 # So many numbers below zero during touches, and more than above zero, show a scale whose sign is
@@ -110,7 +110,7 @@ class LiveCoverage:
         self._board = board
         self._coverage = Coverage(board.rows * board.columns)
         self.log_std = self._coverage.log_std().reshape(board.rows, board.columns)
-        self._least = 0  # numbers before which nothing counts as known
+        self._least = 0  # numbers that are needed
         self.ask_more()
         self.begin()
 
@@ -177,7 +177,17 @@ class LiveCoverage:
     @property
     def known(self) -> Bool:
         """Which cells are known, (R, C)."""
-        return (self.log_std <= KNOWN_LOG) & (self._coverage.numbers >= self._least)
+        return np.asarray(self.log_std <= KNOWN_LOG)
+
+    @property
+    def numbers_left(self) -> int:
+        """How many numbers of the scale are still needed for curve and wires."""
+        return max(self._least - self._coverage.numbers, 0)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all cells, the curve and the wires are known."""
+        return bool(self.known.all()) and not self.numbers_left
 
     @property
     def next_cell(self) -> tuple[int, int]:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From scans of a skin that is pressed anywhere, and the total force meanwhile, to its calibration.
 
-`totals` learns the force curves from the presses. Before that, the wires are learned from the same
-presses. With wrong wires, cells far from the electrodes and cells under much force seem too soft or
-too hard, so that no single curve, with a gain for each cell, fits the total forces.
+`totals` learns the force curves from the presses. Before that, `kneaded_wires` learns the wires
+from the same presses, by trials. For the next trial it asks how the rises follow the wires.
 
 Symbols
 
@@ -23,32 +22,28 @@ wires change by dw, the estimated cells must change so that the currents stay:
     d log g = -(A^T A + 1 / 3^2)^-1 A^T B dw ,    d log x = (g / x) d log g .
 
 3 is the deviation that a touch may have (`UNLIMITED_STD`); without it, cells that the currents
-hardly show would change without limit. `TotalFit` takes these slopes and finds dw together with
-curve and gains. Then the scans are estimated again with the new wires, until these hardly change.
-Few presses tell little of the wires, so what is taken then is no maximum but the mean of all wires
-that they do not exclude (`likely_wires`).
-In the total force, a lead looks like hysteresis. So the leads are not found here: the estimator
-learns them from frames of several touches.
+hardly show would change without limit.
 """
 
 from dataclasses import replace
+from functools import partial
 from itertools import groupby
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from ohmskin.arrays import Bool, Float
+from ohmskin.calibrate.kneaded_wires import Shown, WireSearch, held
 from ohmskin.calibrate.presses import Calibrator, Progress, number_presses
 from ohmskin.calibrate.tables import ForceLog, gaps
-from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
-from ohmskin.calibrate.wires import FoundWires, wire_prior
+from ohmskin.calibrate.totals import TotalFit, Totals
 from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.small import one_blas_thread, solve_positive
 from ohmskin.estimate.base import TOUCH_SIEMENS, Estimator
 from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
-from ohmskin.estimate.prior import UNLIMITED_STD, USUAL_LEAD_STD_OHM
+from ohmskin.estimate.prior import UNLIMITED_STD
 from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.clock import scan_times_s
 from ohmskin.record.recording import Recording
@@ -56,10 +51,9 @@ from ohmskin.record.recording import Recording
 # Of the scans of a press, those are estimated that are so far apart [s]. Chosen: a finger comes, or
 # goes, within four of them.
 SCAN_STEP_S: Final = 0.04
-# For the curves, at most so many scans of presses are estimated. A trial of the wires takes as many
-# scans as have so many cells together: FIRST_CELLS in the first trials, TRIAL_CELLS after a short
-# step. Chosen: 16x16 cells then take some minutes.
-MOST_SCANS, FIRST_CELLS, TRIAL_CELLS = 8000, 60_000, 240_000
+# For the curves, at most so many scans of presses are estimated. Chosen: 16x16 cells then take some
+# minutes.
+MOST_SCANS: Final = 8000
 # Where a trial does not take all presses, it takes stretches of so many that follow each other.
 # Chosen: a slow scale still shows the press before a stretch, which spoils one press of so many.
 STRETCH: Final = 12
@@ -72,22 +66,6 @@ PAUSE_TIMES: Final = 2.0
 # While a board is reset, nobody sees what presses the skin. The scale still shows it for so long
 # after this gap of the scans [s]. Chosen: the slowest scales need it.
 AFTER_GAP_S: Final = 1.0
-# There are at most so many trials of the wires. The steps are logs: the longest one that is taken,
-# the one below which trials take more cells, and the one below which they end.
-TRIALS, LONGEST_STEP, SHORT_STEP, LAST_STEP = 8, 1.5, 0.5, 0.1
-# Trials also end at a step below so many standard deviations of the wires. Chosen: the presses do
-# not tell the wires better.
-CLOSE_STDS: Final = 0.7
-# Segments that nobody has told are at most this in the first trial [ohm]. Chosen: with wires that
-# are far too large, cells under much force conduct without limit, and the slopes tell nothing.
-START_OHM: Final = 50.0
-# The mean of the wires is that of so many trial values of each layer, up to so many deviations from
-# the most likely one, which is this share of what was held at least. Chosen: fine enough for 1 %,
-# and as far as the prior reaches.
-GRID_POINTS, GRID_STDS, LEAST_SHARE = 121, 6.0, 0.2
-# Deviation of the logs of segments that are held, in trials and in the last reading. Chosen: so
-# small that no scan teaches others.
-HELD_LOG_STD: Final = 1e-3
 
 
 class _Levels(NamedTuple):
@@ -103,15 +81,6 @@ class _Levels(NamedTuple):
     rest: Float
     used: Bool
     estimator: Estimator
-
-
-class _Trial(NamedTuple):
-    """A trial of the wires: w, the wires after it, the fit, and how far its sums are off."""
-
-    held: Float
-    wires: WireOhm
-    fit: TotalFit
-    share: float
 
 
 class Kneading:
@@ -162,9 +131,10 @@ class Kneading:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
         wires = calibrator.knowledge.nominal_wire_ohm
         if not calibrator.shows_wires:
-            calibrator.take_wires(self._found_wires(log))
+            search = WireSearch(wires, partial(self._shown, log))
+            calibrator.take_wires(search.found())
             # The curves are of the wires that were found, and not of what scans would teach.
-            wires = _held(calibrator.knowledge.nominal_wire_ohm)
+            wires = held(calibrator.knowledge.nominal_wire_ohm)
         levels = self._levels(calibrator.method, wires, self._spaced(), progress)
         calibrator.estimator = levels.estimator
         return TotalFit(self._totals(levels, log)).fit()
@@ -192,45 +162,11 @@ class Kneading:
         cells = int(np.count_nonzero(used & (self._press >= 0))) * self.shape[0] * self.shape[1]
         return np.asarray(used & (press // STRETCH % (cells // most_cells + 1) == 0))
 
-    def _found_wires(self, log: ForceLog) -> FoundWires:
-        """The wires with which one curve and gains fit the totals best."""
-        told = self._calibrator.knowledge.nominal_wire_ohm
-        centre, std = (of_wires[:2] for of_wires in wire_prior(told))
-        lead_ohm, lead_std_ohm = told.lead_or_usual(USUAL_LEAD_STD_OHM)
-        w, scale = centre, None
-        if told.both is None:
-            w = np.minimum(w, np.log(START_OHM))
-        used, is_first, best = self._in_stretches(FIRST_CELLS), True, None
-        for _ in range(TRIALS):
-            top_ohm, bottom_ohm = np.exp(w).tolist()
-            wires = _held(WireOhm(top_ohm, bottom_ohm, lead_ohm, lead_std_ohm=lead_std_ohm))
-            levels = self._levels(DEFAULT_METHOD, wires, used)
-            wires = levels.estimator.wires()
-            prior = WireSlopes(self._slopes(wires, levels), centre - w, std)
-            fit = TotalFit(self._totals(levels, log), prior, scale).fit()
-            share = fit.residual_share()
-            if best is not None and share > best.share:  # the step from there was too long
-                w = 0.5 * (best.held + w)
-                if np.abs(w - best.held).max() < LAST_STEP:
-                    break
-                continue
-            step, covariance = fit.w
-            stds = np.sqrt(covariance.diagonal())
-            best = _Trial(w, wires, fit, share)
-            lead_ohm, scale = wires.lead or 0.0, fit.scale_
-            w = w + step.clip(-LONGEST_STEP, LONGEST_STEP)
-            if is_first and (np.abs(step) < np.maximum(SHORT_STEP, stds)).all():
-                # Errors of other scans are not to be compared with these.
-                used, is_first, best = self._in_stretches(TRIAL_CELLS), False, None
-            elif (np.abs(step) < np.maximum(LAST_STEP, CLOSE_STDS * stds)).all():
-                break
-        best = best or _Trial(w, wires, fit, share)
-        wires, fit = best.wires, best.fit
-        w, stds = likely_wires(best.held, *fit.w, centre, std)
-        (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(w).tolist(), stds.tolist()
-        lead_std = wires.lead_std_ohm
-        found = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std)
-        return FoundWires(found, told, fit.presses, ())
+    def _shown(self, log: ForceLog, wires: WireOhm, most_cells: int) -> Shown:
+        """What these wires make of some stretches of presses."""
+        levels = self._levels(DEFAULT_METHOD, wires, self._in_stretches(most_cells))
+        wires = levels.estimator.wires()
+        return Shown(self._totals(levels, log), self._slopes(wires, levels), wires)
 
     def _levels(
         self, method: str, wires: WireOhm, used: Bool, progress: Progress = iter
@@ -321,37 +257,3 @@ class Kneading:
             log_siemens = solve_positive(system, by_wires)  # slopes of ports are those by log ohm
             slopes[:, n, pressed] = log_siemens.T * (siemens[pressed] / rises[n, pressed])
         return slopes
-
-
-def likely_wires(
-    held: Float, step: Float, covariance: Float, centre: Float, std: Float
-) -> tuple[Float, Float]:
-    """Mean and standard deviation of the logs of the segments, each (2,).
-
-    held: w for which the rises were estimated. step, covariance: what a fit with the prior found.
-    centre, std: of that prior.
-
-    Presses tell ohms: what they say is normal about the segments themselves, and the prior about
-    their logs. So where presses tell little, w of most likelihood is far above the mean: what they
-    cannot exclude reaches up to the largest segments, but down to none.
-    """
-    prior = np.diag(std**-2.0)
-    precision = np.linalg.inv(covariance)
-    pull = precision @ step - prior @ (centre - held)  # that of the presses alone
-    precision = precision - prior
-    share = np.maximum(1 + step, LEAST_SHARE)  # of the segments that were held
-    reach = np.linspace(-GRID_STDS, GRID_STDS, GRID_POINTS)[:, None]
-    axes = held + np.log(share) + reach * np.sqrt(covariance.diagonal()) / np.minimum(share, 1.0)
-    logs = np.stack(np.meshgrid(*axes.T, indexing="ij"), axis=-1).reshape(-1, 2)
-    more = np.expm1(logs - held)  # the change of a segment, over what was held
-    score = more @ pull - 0.5 * np.sum(more @ precision * more, axis=1)
-    score -= 0.5 * np.sum(((logs - centre) / std) ** 2, axis=1)
-    weight = np.exp(score - score.max())
-    weight /= weight.sum()
-    mean = weight @ logs
-    return mean, np.sqrt(weight @ (logs - mean) ** 2)
-
-
-def _held(wires: WireOhm) -> WireOhm:
-    """These wires, told so that no scan teaches other segments; leads are learned."""
-    return wires._replace(top_log_std=HELD_LOG_STD, bottom_log_std=HELD_LOG_STD)

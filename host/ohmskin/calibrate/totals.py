@@ -18,7 +18,7 @@ v, M     (n,)     force on a cell that is pressed too little to be seen; number 
                   cells that seem untouched, beside touched ones
 g, e     (C,)     log of each cell's gain about the curve of k and b; its exponent about b  1
 P        (n, C)   force on each cell                                                    N
-w        (2,)     logs of a top and of a bottom segment, less those that x is of        1
+w        (2,)     change of a top and of a bottom segment, as a share of those of x     1
 S                 the scale's filter (`scale`): (n,) to (m,); its delay is learned here
 z        (q,)     zero of the scale at times `KNOT_S` apart; B (m, q) is straight       N
                   between them
@@ -34,7 +34,8 @@ F0 is large because some errors are as large in newtons at a small force as at a
 cells that have not come back yet from the press before. The fit is least squares (Gauss-Newton)
 with these priors: gains scatter by `GAIN_STD` about the curve of all cells, which the fit corrects
 by the scatter that it sees; b is near `EXPONENT`; the zero changes by about `ZERO_STEP_N` from knot
-to knot; w is what was told of the wires.
+to knot; w is what was told of the wires. x is that of the wires that are held in a trial, so the
+fit has no w in it, and is asked for w after it (`TotalFit.wires`).
 
 A fingertip covers some ten cells, so sums tell little of how gains of neighbours differ. That the
 forces under a fingertip are smooth tells more of it (`smoothness`): g and e follow that, too. Not
@@ -94,9 +95,6 @@ BEND_STD: Final = 0.02
 SERIES: Final = 0.05
 # t goes from -1 to 1 while log x rises by this. Chosen: the noise of a pressed cell is less.
 TURN_LOG: Final = 0.1
-# With other wires, at least this share is left of a rise. Chosen: slopes hold for small changes of
-# the wires only, and a rise must stay above 0.
-LEAST_LEFT: Final = 0.2
 # Standard deviations of k, b, c, h and v [N] before any press. Chosen: k is free, half of the cells
 # have no series resistance to speak of, and 0.1 N on one cell is seen.
 FIRST_STD: Final = (10.0, EXPONENT_STD, 0.1, 0.1, 0.1)
@@ -137,6 +135,8 @@ SURE_SHARE: Final = 0.7
 # Errors of presses scatter as Student's t of so many degrees of freedom. Chosen: the usual number
 # for errors that are normal but for a few.
 FREEDOM: Final = 4.0
+# So often is the width of Student's t corrected. Chosen: it changes by less than 1 % then.
+WIDTH_ROUNDS: Final = 20
 # A press is never left out that is off by less than this share, or by less than this force [N].
 LEAST_OFF: Final = 0.15
 LEAST_OFF_N: Final = 0.15
@@ -189,16 +189,16 @@ class WireSlopes(NamedTuple):
 class TotalFit:
     """The fit of the module's equations.
 
-    scale: the scale's filter; None: it is found. After `fit`: `scale_`; `covariance_` of k, b, c,
-    h, v, w, g, e, z and the delay; `largest_n`, the largest force of all cells together [N].
+    scale: the scale's filter; None: it is found. for_wires: whether wires are looked for. After
+    `fit`: `scale_`; `covariance_` of k, b, c, h, v, g, e, z and the delay; `largest_n`, the largest
+    force of all cells together [N].
     """
 
     def __init__(
-        self, totals: Totals, wires: WireSlopes | None = None, scale: Scale | None = None
+        self, totals: Totals, scale: Scale | None = None, *, for_wires: bool = False
     ) -> None:
-        self._totals, self._wires, self._seeks_scale = totals, wires, scale is None
+        self._totals, self._for_wires, self._seeks_scale = totals, for_wires, scale is None
         cells = totals.rise.shape[1]
-        offsets = 0 if wires is None else wires.centre.size
         self.scale_ = scale or Scale()
         self._on = (totals.rise > 0) & (totals.press >= 0)[:, None]
         _check_enough(np.unique(totals.press[self._on.any(axis=1)]).size)
@@ -207,11 +207,11 @@ class TotalFit:
         self._log_x = np.log(np.where(self._on, totals.rise, self._unit) / self._unit)
         self._set_zero()
         self._turn = _turns(self._log_x, self._on)
-        sizes = (5, offsets, cells, cells, self._basis.shape[1], int(totals.lags))
+        sizes = (5, cells, cells, self._basis.shape[1], int(totals.lags))
         ends = np.cumsum(sizes).tolist()
         parts = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
-        # p: k, b, c, h, v; w; g; e; z; delay
-        self._of_wires, self._of_gains, self._of_bends, self._of_zero, self._of_delay = parts[1:]
+        # p: k, b, c, h, v; g; e; z; delay
+        self._of_gains, self._of_bends, self._of_zero, self._of_delay = parts[1:]
         self._p = np.zeros(ends[-1])
         self._p[1:3] = EXPONENT, SERIES
         self._gain_std = FIRST_GAIN_STD
@@ -255,21 +255,9 @@ class TotalFit:
 
     def _contact(self) -> tuple[Float, Float, Float]:
         """log(x' / x0), and its slopes by log x and by c, each (n, C)."""
-        log_x = self._log_x
-        if self._wires is not None:
-            log_x = log_x + np.log(self._changed())
-        u = np.exp(log_x) * self._unit / self._hard
+        u = np.exp(self._log_x) * self._unit / self._hard
         steeper = 1 / self._loss(u)
-        return log_x + np.log(steeper) + self._p[3] * self._turn, steeper, u * steeper
-
-    def _changed(self) -> Float:
-        """The factor by which x changes with w, (n, C).
-
-        It is 1 + slope w and not its exponential, which would let small rises grow without end.
-        """
-        assert self._wires is not None
-        change = np.tensordot(self._p[self._of_wires], self._wires.slopes, 1)
-        return np.asarray(np.maximum(1 + change, LEAST_LEFT))
+        return self._log_x + np.log(steeper) + self._p[3] * self._turn, steeper, u * steeper
 
     def _loss(self, u: Float) -> Float:
         """x / x' of rises u = x / x1."""
@@ -302,7 +290,7 @@ class TotalFit:
                 self._fit_scale()
             self._step()
             self._judge(trims=number >= ROBUST_ROUNDS)
-        if not self.residual_share() < MOST_SHARE:
+        if not (self._for_wires or self.residual_share() < MOST_SHARE):
             raise ValueError(STRANGE)
         return self
 
@@ -319,14 +307,8 @@ class TotalFit:
 
     def _step(self) -> None:
         """One step of Gauss-Newton."""
-        jacobian = self._jacobian()
-        self.off_n_ = self._totals.shown_n - self.total_n_ - self._basis @ self._p[self._of_zero]
-        weight = self._weights()
-        precision, pull = self._prior()
-        weighted = jacobian * weight[:, None]
-        precision = precision + weighted.T @ jacobian
-        pull += weighted.T @ self.off_n_
-        if self._wires is None and (smooth := self._smoothness()):
+        precision, pull = self._equations(self._jacobian(), *self._prior())
+        if not self._for_wires and (smooth := self._smoothness()):
             of_both = slice(self._of_gains.start, self._of_bends.stop)
             precision[of_both, of_both] += smooth.precision
             pull[of_both] += smooth.pull
@@ -337,6 +319,12 @@ class TotalFit:
         self.covariance_ = np.linalg.inv(precision)
         if self._totals.lags:
             self._take_scale(replace(self.scale_, delay_s=max(float(p[-1]), EARLIEST_S)))
+
+    def _equations(self, jacobian: Float, precision: Float, pull: Float) -> tuple[Float, Float]:
+        """These priors, with what the rows add to them; sets `off_n_`."""
+        self.off_n_ = self._totals.shown_n - self.total_n_ - self._basis @ self._p[self._of_zero]
+        weighted = jacobian * self._weights()[:, None]
+        return precision + weighted.T @ jacobian, pull + weighted.T @ self.off_n_
 
     def _smoothness(self) -> Smoothness | None:
         """What the presses that are kept tell of gains and exponents by being smooth."""
@@ -349,11 +337,9 @@ class TotalFit:
     def _jacobian(self) -> Float:
         """How what the scale shows follows p, (m, p); sets `total_n_`, what it is to show."""
         totals, b, v = self._totals, self._p[1] + self._p[self._of_bends], self._p[4]
-        log_contact, steeper, by_series = self._contact()
+        log_contact, _, by_series = self._contact()
         parts = self._parts(log_contact)
         slopes = [np.ones_like(parts), log_contact, b * by_series, b * self._turn]
-        if self._wires is not None:
-            slopes += list(b * steeper * self._wires.slopes / self._changed())
         columns = [(parts * slope).sum(axis=1) for slope in slopes]
         columns.insert(4, totals.margin)
         shown = self._shown(np.column_stack([*columns, parts, parts * log_contact]))
@@ -377,7 +363,7 @@ class TotalFit:
         moves = self._pressed | self._ends | (total_n > s0)
         variance = s0**2 + np.where(moves, (s1 * size_n) ** 2, 0.0)
         rows = np.bincount(self._of_row, minlength=self._groups)[self._of_row]
-        press_rows = PRESS_ROWS if self._wires is None else WIRE_PRESS_ROWS
+        press_rows = WIRE_PRESS_ROWS if self._for_wires else PRESS_ROWS
         share = np.where(self._pressed, np.minimum(1.0, press_rows / rows), 1.0)
         return np.asarray(kept * share * self._trust[self._of_row] / variance)
 
@@ -388,8 +374,6 @@ class TotalFit:
         centre[:3], std[:5] = (p[0], EXPONENT, SERIES), FIRST_STD
         std[self._of_bends] = BEND_STD
         centre[self._of_delay], std[self._of_delay] = p[self._of_delay], DELAY_STD_S
-        if self._wires is not None:
-            centre[self._of_wires], std[self._of_wires] = self._wires.centre, self._wires.std
         precision = np.diag(std**-2.0)
         precision[self._of_zero, self._of_zero] = self._zero_precision
         return precision, precision @ (centre - p)
@@ -430,11 +414,26 @@ class TotalFit:
 
     # ------------------------------------------------------------------------------ the answer
 
-    @property
-    def w(self) -> tuple[Float, Float]:
-        """w, (2,), and its covariance, (2, 2)."""
-        of_wires = self._of_wires
-        return self._p[of_wires], np.asarray(self.covariance_[of_wires, of_wires])
+    def wires(self, given: WireSlopes) -> tuple[Float, Float]:
+        """The change w of the wires that fits best, (2,), and its covariance, (2, 2).
+
+        It is one step of Gauss-Newton of p and w together. More steps would follow the slopes to
+        wires for which they do not hold.
+        """
+        from scipy.linalg import block_diag
+
+        log_contact, steeper, _ = self._contact()
+        b = self._p[1] + self._p[self._of_bends]
+        forces = np.sum(self._parts(log_contact) * b * steeper * given.slopes, axis=2)
+        precision, pull = self._prior()
+        of_wires = given.std**-2.0
+        precision, pull = self._equations(
+            np.hstack([self._shown(forces.T), self._jacobian()]),
+            block_diag(np.diag(of_wires), precision),
+            np.concatenate([of_wires * given.centre, pull]),
+        )
+        covariance = np.asarray(np.linalg.inv(precision)[:2, :2])
+        return np.asarray(np.linalg.solve(precision, pull)[:2]), covariance
 
     @property
     def presses(self) -> int:
@@ -500,6 +499,24 @@ class TotalFit:
         force = np.exp(self._p[1] * log_contact)
         steeper, level = np.polyfit(np.log(x / self._unit), log_contact, 1, w=force)
         return float(level), float(steeper)
+
+    def misfit(self) -> float:
+        """-log of how likely rows and p are, for each press, but for a constant. All presses count.
+
+        Errors of rows, as shares of the force, scatter as Student's t, whose width fits them best.
+        """
+        rows = self._pressed
+        square = (self.off_n_[rows] / np.hypot(self.total_n_[rows], self._floor_n)) ** 2
+        weight = 1.0 / np.bincount(self._of_row, minlength=self._groups)[self._of_row[rows]]
+        width = float(np.median(square))
+        for _ in range(WIDTH_ROUNDS):
+            pull = (FREEDOM + 1) / (FREEDOM + square / width)
+            width = float(weight @ (pull * square) / weight.sum())
+        unlikely = 0.5 * (np.log(width) + (FREEDOM + 1) * np.log1p(square / (FREEDOM * width)))
+        precision, pull = self._prior()
+        of_p = 0.5 * pull @ np.linalg.solve(precision, pull)
+        gains = self._totals.rise.shape[1] * np.log(self._gain_std)
+        return float((weight @ unlikely + of_p + gains) / weight.sum())
 
     def residual_share(self) -> float:
         """s1 of each cell, from how far sums are off."""

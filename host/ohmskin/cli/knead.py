@@ -65,7 +65,9 @@ class KneadMap:
         known = self._coverage.known
         row, column = self._coverage.next_cell
         text = f"{known.sum()} of {known.size} cells are known to {100 * KNOWN_LOG:.0f} %"
-        return text if known.all() else f"{text}, press at row {row}, column {column}"
+        if left := self._coverage.numbers_left:
+            text += f", the wires need {left} more numbers of the scale"
+        return text if self._coverage.is_done else f"{text}, press at row {row}, column {column}"
 
     def picture(self) -> Group:
         """All of it."""
@@ -97,9 +99,9 @@ def kneaded(
         coverage = LiveCoverage(skin.info)
         for given in recordings:
             coverage.look_at(given)
-        if coverage.known.all() and not _is_newer(out, before):  # the fit has failed
+        if coverage.is_done and not _is_newer(out, before):  # the fit has failed
             coverage.ask_more()
-        if not coverage.known.all():
+        if not coverage.is_done:
             try:
                 goes_on = _knead(skin, path, sensor_at(skin, *scale), coverage, seconds)
             except TareRefused:
@@ -110,7 +112,7 @@ def kneaded(
                     raise
                 raise DeviceLost(f"{exc} (the same command goes on from {path})") from exc
             recordings += [load_recording(path)] if goes_on else []
-    return recordings, bool(coverage.known.all())
+    return recordings, coverage.is_done
 
 
 def _is_newer(out: Path, recordings: list[Path]) -> bool:
@@ -139,7 +141,7 @@ def _knead(
         scans = asked_for(until_ctrl_c(skin), 0, seconds)
         if sensor is None:
             scans = with_truth(scans, skin, recorder)
-        unknown = takewhile(lambda _: not coverage.known.all(), scans)
+        unknown = takewhile(lambda _: not coverage.is_done, scans)
         recording.record(
             skin, recorder, unknown, tare_s=FORCE_TARE_S, sensor=sensor, beside=shown.look
         )

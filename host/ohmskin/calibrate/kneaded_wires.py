@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wires of a skin that was pressed anywhere: those with which one curve fits the total forces.
+
+With wrong wires, cells far from the electrodes and cells under much force seem too soft or too
+hard, so that no single curve, with a gain for each cell, fits the total forces.
+
+Symbols
+
+====== ======= ========================================================================= =======
+symbol shape   meaning                                                                   unit
+====== ======= ========================================================================= =======
+u      (2,)    logs of a top and of a bottom segment                                     1
+L              -log of how likely the total forces are (`TotalFit.misfit`), for a press    1
+====== ======= ========================================================================= =======
+
+In a trial, the wires are held at some u, an estimator shows the scans, and a `TotalFit` has L. It
+also tells by which shares w of themselves the segments should change (`TotalFit.wires`). Presses
+tell ohms, so the next trial is at u + log(1 + w). If its L is larger, that was too far, and half
+of the way is tried.
+
+Few presses tell little of the wires, so what is taken at last is no maximum but the mean of all
+wires that they do not exclude (`likely_wires`). Behind wires that are too large, the cells under
+much force conduct without limit, which w says nothing of. So the mean, too, is tried.
+
+In the total force, a lead looks like a resistance in series with each contact. So leads are not
+found here: the estimator learns them from frames of several touches.
+"""
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ohmskin.arrays import Float
+from ohmskin.calibrate.scale import Scale
+from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
+from ohmskin.calibrate.wires import FoundWires, wire_prior
+from ohmskin.estimate.knowledge import WireOhm
+from ohmskin.estimate.prior import USUAL_LEAD_STD_OHM
+
+# A trial takes as many scans as have about so many cells together: the first number in the first
+# trials, the second one after a short step. Chosen: 16x16 cells then take some minutes.
+FIRST_CELLS, TRIAL_CELLS = 60_000, 240_000
+# There are at most so many trials with either number of scans. The steps are logs: the longest one
+# that is taken, the one below which trials take more cells, and the one below which they end.
+TRIALS, LONGEST_STEP, SHORT_STEP, LAST_STEP = 6, 1.5, 0.5, 0.1
+# Trials also end at a step below so many standard deviations of the wires, with the first number of
+# scans and with the second. Chosen: the presses do not tell the wires better.
+CLOSE_STDS: Final = (1.0, 0.7)
+# Segments that nobody has told are at most this in the first trial [ohm]. Chosen: from there, steps
+# lead to the wires that textiles have. With wires that are far too large, cells under much force
+# conduct without limit.
+START_OHM: Final = 50.0
+# L of all presses together may grow by so much with a step, or to the mean. Chosen: the same wires,
+# estimated again with another lead, differ by so much, and a mean is about so far from the most
+# likely wires.
+LIKELY: Final = 3.0
+# The mean of the wires is that of so many trial values of each layer, up to so many deviations from
+# the most likely one, which is this share of what was held at least. Chosen: fine enough for 1 %,
+# and as far as the prior reaches.
+GRID_POINTS, GRID_STDS, LEAST_SHARE = 121, 6.0, 0.2
+# Deviation of the logs of segments that are held, in trials and in the last reading. Chosen: so
+# small that no scan teaches others.
+HELD_LOG_STD: Final = 1e-3
+
+
+class Shown(NamedTuple):
+    """What an estimator shows of the scans while some wires are held.
+
+    slopes: how its rises follow the wires, (2, n, C), as in `WireSlopes`.
+    wires: these wires, with the lead that the scans have taught.
+    """
+
+    totals: Totals
+    slopes: Float
+    wires: WireOhm
+
+
+class _Trial(NamedTuple):
+    """A trial: u, the wires after it, the fit, L, w and the covariance of w, (2, 2)."""
+
+    held: Float
+    wires: WireOhm
+    fit: TotalFit
+    misfit: float
+    change: Float
+    covariance: Float
+
+    @property
+    def step(self) -> Float:
+        """The step of u to the next trial, (2,). To smaller wires, w is the step."""
+        longer = np.log1p(np.maximum(self.change, 0.0))
+        step = np.where(self.change > 0, longer, self.change)
+        return np.asarray(step.clip(-LONGEST_STEP, LONGEST_STEP))
+
+    def is_close(self, short: float, stds: float) -> bool:
+        """Whether the step is short, or below so many of its deviations."""
+        least = np.maximum(short, stds * np.sqrt(self.covariance.diagonal()))
+        return bool((np.abs(self.step) < least).all())
+
+
+class WireSearch:
+    """Looks for the wires.
+
+    told: what was told of them.
+    show: what an estimator shows while the given wires are held, in scans that have about so many
+        cells together at most.
+    """
+
+    def __init__(self, told: WireOhm, show: Callable[[WireOhm, int], Shown]) -> None:
+        self._told, self._show, self._most_cells = told, show, FIRST_CELLS
+        self._scale: Scale | None = None
+        self._centre, self._std = (of_wires[:2] for of_wires in wire_prior(told))
+
+    def found(self) -> FoundWires:
+        """The wires. Raises ValueError where the force does not follow the skin."""
+        start = self._centre
+        if self._told.both is None:
+            start = np.minimum(start, np.log(START_OHM))
+        best = self._nearest(self._trial(start, None), SHORT_STEP, CLOSE_STDS[0])
+        # L of more scans is not to be compared with that before, nor L of another filter.
+        self._most_cells = TRIAL_CELLS
+        best = self._trial(best.held + best.step, best)
+        self._scale = best.fit.scale_
+        best = self._nearest(best, LAST_STEP, CLOSE_STDS[1])
+        u, stds = likely_wires(best.held, best.change, best.covariance, self._centre, self._std)
+        if np.abs(u - best.held).max() > LAST_STEP:
+            u = self._tried(u, best, TRIALS)[0].held
+        (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(u).tolist(), stds.tolist()
+        lead = best.wires.lead, best.wires.lead_std_ohm
+        wires = WireOhm(top_ohm, bottom_ohm, lead[0], top_std, bottom_std, lead[1])
+        return FoundWires(wires, self._told, best.fit.presses, ())
+
+    def _trial(self, u: Float, last: _Trial | None) -> _Trial:
+        """A trial. last: the one whose lead is taken, if any."""
+        lead_ohm, lead_std_ohm = self._told.lead_or_usual(USUAL_LEAD_STD_OHM)
+        lead = lead_ohm if last is None else last.wires.lead
+        top_ohm, bottom_ohm = np.exp(u).tolist()
+        wires = held(WireOhm(top_ohm, bottom_ohm, lead, lead_std_ohm=lead_std_ohm))
+        shown = self._show(wires, self._most_cells)
+        fit = TotalFit(shown.totals, self._scale, for_wires=True).fit()
+        off = self._centre - u
+        by_wires = fit.wires(WireSlopes(shown.slopes, off, self._std))
+        return _Trial(u, shown.wires, fit, fit.misfit(), *by_wires)
+
+    def _nearest(self, best: _Trial, short: float, stds: float) -> _Trial:
+        """The best trial of all steps until they are short."""
+        left = TRIALS
+        while left and not best.is_close(short, stds):
+            before = best
+            best, left = self._tried(best.held + best.step, best, left)
+            if best is before:
+                break
+        return best
+
+    def _tried(self, u: Float, best: _Trial, left: int) -> tuple[_Trial, int]:
+        """A trial of u, or halfway to the best one, whose L is no larger than that one's.
+
+        left: how many trials there may be. Returns the best trial if there is none, and how many
+        are left.
+        """
+        while left and np.abs(u - best.held).max() > LAST_STEP:
+            trial, left = self._trial(u, best), left - 1
+            if trial.misfit <= best.misfit + LIKELY / best.fit.presses:
+                return trial, left
+            u = 0.5 * (best.held + u)
+        return best, left
+
+
+def held(wires: WireOhm) -> WireOhm:
+    """These wires, told so that no scan teaches other segments; leads are learned."""
+    return wires._replace(top_log_std=HELD_LOG_STD, bottom_log_std=HELD_LOG_STD)
+
+
+def likely_wires(
+    held: Float, step: Float, covariance: Float, centre: Float, std: Float
+) -> tuple[Float, Float]:
+    """Mean and standard deviation of the logs of the segments, each (2,).
+
+    held: w for which the rises were estimated. step, covariance: what a fit with the prior found.
+    centre, std: of that prior.
+
+    Presses tell ohms: what they say is normal about the segments themselves, and the prior about
+    their logs. So where presses tell little, w of most likelihood is far above the mean: what they
+    cannot exclude reaches up to the largest segments, but down to none.
+    """
+    prior = np.diag(std**-2.0)
+    precision = np.linalg.inv(covariance)
+    pull = precision @ step - prior @ (centre - held)  # that of the presses alone
+    precision = precision - prior
+    share = np.maximum(1 + step, LEAST_SHARE)  # of the segments that were held
+    reach = np.linspace(-GRID_STDS, GRID_STDS, GRID_POINTS)[:, None]
+    axes = held + np.log(share) + reach * np.sqrt(covariance.diagonal()) / np.minimum(share, 1.0)
+    logs = np.stack(np.meshgrid(*axes.T, indexing="ij"), axis=-1).reshape(-1, 2)
+    more = np.expm1(logs - held)  # the change of a segment, over what was held
+    score = more @ pull - 0.5 * np.sum(more @ precision * more, axis=1)
+    score -= 0.5 * np.sum(((logs - centre) / std) ** 2, axis=1)
+    weight = np.exp(score - score.max())
+    weight /= weight.sum()
+    mean = weight @ logs
+    return mean, np.sqrt(weight @ (logs - mean) ** 2)

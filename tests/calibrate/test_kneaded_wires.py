@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search for the wires of a kneaded skin, behind paths whose resistances are known exactly."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from ohmskin.arrays import Float
+from ohmskin.calibrate.kneaded_wires import Shown, WireSearch, likely_wires
+from ohmskin.calibrate.scale import Scale
+from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
+from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
+
+SHAPE, PRESSES, STEP_S, PERIOD_S = (4, 5), 160, 0.02, 0.6
+TOP_SEGMENTS, BOTTOM_SEGMENTS = (n.ravel() + 1 for n in np.indices(SHAPE)[::-1])
+
+
+@dataclass
+class Skin:
+    """Presses of three cells each, whose contacts are in series with their paths alone.
+
+    An estimator that believes other wires sees what is left of the measured resistance of each cell
+    without the path that it believes in. Nothing of it is the package's.
+    """
+
+    top_ohm: float
+    bottom_ohm: float
+    noise: float = 0.02
+    believed: list[tuple[float, float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        random, cells = np.random.default_rng(7), SHAPE[0] * SHAPE[1]
+        self._time_s = np.arange(0.0, PERIOD_S * PRESSES, STEP_S)
+        number, phase_s = np.divmod(self._time_s, PERIOD_S)
+        is_pressed = phase_s < 0.4
+        self._press = np.where(is_pressed, number, -1).astype(np.intp)
+        peaks_n = np.zeros((PRESSES, cells))
+        for peak_n in peaks_n:
+            peak_n[random.choice(cells, 3, replace=False)] = random.uniform(0.5, 5.0, 3)
+        wave = np.where(is_pressed, np.sin(np.pi * phase_s / 0.4), 0.0)
+        force_n = peaks_n[number.astype(int)] * wave[:, None]
+        siemens = 4e-5 * np.exp(0.15 * random.standard_normal(cells)) * force_n**1.5
+        self._rise = self._behind(siemens, self.top_ohm, self.bottom_ohm)
+        factors = 1 + self.noise * random.standard_normal(PRESSES)
+        total_n = force_n.sum(axis=1) * factors[number.astype(int)]
+        self._shown_s = np.arange(0.5, self._time_s[-1], 0.1)
+        self._shown_n = Scale(0.05, 0.1).shown(self._time_s, total_n[:, None], self._shown_s)[:, 0]
+        self._shown_n += 0.01 * random.standard_normal(self._shown_s.size)
+
+    @staticmethod
+    def _behind(siemens: Float, top_ohm: float, bottom_ohm: float) -> Float:
+        path_ohm = TOP_SEGMENTS * top_ohm + BOTTOM_SEGMENTS * bottom_ohm
+        return np.asarray(siemens / (1 + siemens * path_ohm))
+
+    def seen(self, top_ohm: float, bottom_ohm: float) -> Float:
+        """What an estimator that believes these wires sees of the contacts [S]."""
+        path_ohm = TOP_SEGMENTS * top_ohm + BOTTOM_SEGMENTS * bottom_ohm
+        return np.asarray(self._rise / np.maximum(1 - self._rise * path_ohm, 0.02))
+
+    def show(self, wires: WireOhm, most_cells: int) -> Shown:
+        assert most_cells >= 60_000
+        assert wires.both is not None
+        self.believed.append(wires.both)
+        rise = self.seen(*wires.both)
+        segments = np.array([TOP_SEGMENTS, BOTTOM_SEGMENTS])[:, None, :]
+        slopes = rise * segments * np.array(wires.both)[:, None, None]
+        none = np.zeros_like(self._time_s)
+        of_skin = self._time_s, rise, self._press, none
+        return Shown(Totals(SHAPE, *of_skin, self._shown_s, self._shown_n), slopes, wires)
+
+
+@pytest.mark.parametrize("ohm", [(20.0, 40.0), (100.0, 200.0), (60.0, 900.0), (1000.0, 2000.0)])
+def test_wires_are_found_from_a_start_far_away(ohm: tuple[float, float]) -> None:
+    skin = Skin(*ohm)
+    found = WireSearch(NO_WIRES, skin.show).found().wires
+    assert found.both is not None
+    assert found.top_log_std is not None
+    assert found.bottom_log_std is not None
+    off = np.abs(np.log(np.array(found.both) / ohm))
+    stated = np.array([found.top_log_std, found.bottom_log_std])
+    assert (off < np.maximum(3 * stated, 0.1)).all(), (found, len(skin.believed))
+    longest_ohm = np.array([TOP_SEGMENTS.max(), BOTTOM_SEGMENTS.max()]) * (
+        np.array(found.both) - ohm
+    )
+    assert np.abs(longest_ohm).max() < 350  # what a hard press has
+    assert len(skin.believed) < 12
+
+
+def test_a_step_that_is_too_long_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where presses told little of the wires, one step led to 1.4 kohm, and to no way back."""
+    skin, usual = Skin(100.0, 200.0), TotalFit.wires
+
+    def overdone(fit: TotalFit, slopes: WireSlopes) -> tuple[Float, Float]:
+        change, covariance = usual(fit, slopes)
+        return 4 * change, covariance
+
+    monkeypatch.setattr(TotalFit, "wires", overdone)
+    found = WireSearch(NO_WIRES, skin.show).found().wires
+    assert max(bottom for _, bottom in skin.believed) > 350  # a step went too far
+    assert found.top == pytest.approx(100, rel=0.4)
+    assert found.bottom == pytest.approx(200, rel=0.4)
+
+
+def test_wires_that_were_told_are_evidence() -> None:
+    """Presses that hardly tell them leave them as they were told; sure presses correct them."""
+    told = WireOhm(150.0, 300.0, top_log_std=0.05, bottom_log_std=0.05)
+    vague = WireSearch(told, Skin(100.0, 200.0, noise=0.5).show).found().wires
+    assert vague.top == pytest.approx(150, rel=0.25)
+    loose = told._replace(top_log_std=0.7, bottom_log_std=0.7)
+    sure = WireSearch(loose, Skin(100.0, 200.0, noise=0.005).show).found().wires
+    assert sure.top == pytest.approx(100, rel=0.15)
+    assert sure.bottom == pytest.approx(200, rel=0.15)
+
+
+@pytest.mark.parametrize(("ohm", "std_ohm"), [(100.0, 5.0), (500.0, 250.0), (200.0, 400.0)])
+def test_wires_are_a_mean_of_what_presses_do_not_exclude(ohm: float, std_ohm: float) -> None:
+    """Two layers of which presses tell this in ohms, and whose logs were expected about 150 ohm."""
+    held, centre, std = np.log(180.0), np.log(150.0), 1.5
+    precision = (180.0 / std_ohm) ** 2  # of the share by which a segment differs from that
+    covariance = 1 / (precision + std**-2)
+    step = covariance * (precision * (ohm / 180.0 - 1) + (centre - held) / std**2)
+    alike = np.ones(2)
+    mean, deviation = likely_wires(
+        held * alike, step * alike, covariance * np.eye(2), centre * alike, std * alike
+    )
+
+    def density(log_ohm: float) -> float:
+        return float(
+            np.exp(-0.5 * ((np.exp(log_ohm) - ohm) / std_ohm) ** 2)
+            * np.exp(-0.5 * ((log_ohm - centre) / std) ** 2)
+        )
+
+    powers = [
+        quad(lambda log_ohm, n=n: density(log_ohm) * log_ohm**n, -3, 10, points=[4, 5, 6])[0]
+        for n in range(3)
+    ]
+    expected = powers[1] / powers[0]
+    assert mean == pytest.approx(expected, abs=0.02)
+    assert deviation == pytest.approx(np.sqrt(powers[2] / powers[0] - expected**2), rel=0.05)
