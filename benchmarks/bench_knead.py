@@ -21,6 +21,10 @@ beside    one fingertip in ten presses beside the skin, too: RMSE over that with
           these presses are named, and how many others are left out [%].
 weights   WEIGHTS_tips: as above, after so many weights, each laid somewhere at rest.
 large     16x16, 20,000 scans: seconds of the whole command, and its memory.
+live      ``calibrate knead`` of an emulated skin over an emulated scale, in real time: seconds of
+          the whole command, until every cell is known to 15 % and all is learned, the longest;
+          live_over_single: RMSE over that after a robot's presses of the same skin (scene
+          "presses"), in readings that are exact but for the converter; the median.
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,10 +43,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+import ohmskin
 from bars import ALL, Bar, Part, at_least, at_most, finish, options  # beside this file
 from command_line import PRINTS_PEAK  # tests/helpers
 from kneaded_skin import KneadedSkin, Scale
-from pressed_skin import Forces, Plan, calibrate
+from ohmskin.emulate.scenes import Scene
+from ohmskin.force.calibration import load_calibration
+from ohmskin.force.reader import SkinReader
+from ohmskin.link.codes import quantise
+from ohmskin.link.messages import Scan
+from pressed_skin import TOUCH_N, Forces, Plan, calibrate
 from studies.rows import in_processes
 
 WIRES = {"100_200": (100.0, 200.0), "500_1000": (500.0, 1000.0), "20_40": (20.0, 40.0)}
@@ -80,7 +91,7 @@ class Shown(NamedTuple):
 
     task: Task
     by: dict[str, Read]
-    skin: KneadedSkin
+    skin: KneadedSkin | None  # None: an emulated one
 
 
 def knead(recording: Path, out: Path) -> dict[str, Any]:
@@ -95,8 +106,80 @@ def knead(recording: Path, out: Path) -> dict[str, Any]:
     return said | {"seconds": time.monotonic() - begin_s, "gigabytes": int(peak_kb) / 1e6}
 
 
+class EmulatedSkin:
+    """The emulated skin of a seed, under touches of single cells as those of `KneadedSkin`."""
+
+    def __init__(self, seed: int, part: Part) -> None:
+        size = "2x2" if part is not ALL else "8x8"
+        self.url = f"emulator://{size}?seed={seed}&scene="
+        with ohmskin.open(f"{self.url}weights", start=False) as board:
+            self._board = board.info
+        rows, columns = shape = self._board.rows, self._board.columns
+        scene, random = Scene("weights", rows, columns, seed=seed), np.random.default_rng(seed)
+        self._true_n = np.zeros((part.of(100), *shape))
+        self._codes = []
+        for true_n in self._true_n:
+            siemens = scene.rest.cell_siemens.copy()
+            touches = random.integers(2, min(6, true_n.size) + 1)
+            for number in random.permutation(true_n.size)[:touches].tolist():
+                cell = divmod(number, columns)
+                true_n[cell] = random.uniform(*TOUCH_N)
+                scene.put((cell, true_n[cell]))
+                siemens[cell] = scene.skin(0.0).cell_siemens[cell]
+            skin = replace(scene.rest, cell_siemens=siemens)
+            self._codes.append(quantise(scene.faults.readings(skin)))
+
+    def read(self, calibration: Path) -> Forces:
+        """What a later use of the skin shows of its touches."""
+        reader = SkinReader(self._board, load_calibration(calibration))
+        scans = [
+            reader.read(Scan(codes, number, 11_111 * number, number / 90, 0))
+            for number, codes in enumerate(self._codes)
+        ]
+        return Forces(
+            self._true_n,
+            np.array([scan.force_n for scan in scans]),
+            np.array([scan.force_n_std for scan in scans]),
+            np.array([scan.estimate.converged for scan in scans]),
+        )
+
+
+def ohmskin_says(*arguments: str | Path) -> str:
+    """Run the command, and return what it prints."""
+    command = [sys.executable, "-m", "ohmskin", *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def show_live(task: Task) -> Shown:
+    """Knead an emulated skin in real time, and press it by a robot."""
+    skin, by = EmulatedSkin(task.seed, task.part), {}
+    with tempfile.TemporaryDirectory() as place:
+        file, recording = Path(place, "skin.json"), Path(place, "robot.mcap")
+        command = [sys.executable, "-m", "ohmskin", "emulate", f"{skin.url}knead"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as emulated:
+            assert emulated.stdout is not None
+            board, scale = (emulated.stdout.readline().strip() for _ in range(2))
+            begin_s = time.monotonic()
+            ohmskin_says("calibrate", "knead", board, file, "--force-port", scale)
+            seconds = time.monotonic() - begin_s
+            emulated.terminate()
+        read = skin.read(file)
+        by["total"] = Read(read, read, {"seconds": seconds})
+        span_s = "25" if task.part is not ALL else "300"
+        presses = f"{skin.url}presses&rate=30&speed=0", recording
+        ohmskin_says("record", *presses, "--force-port", "truth", "--seconds", span_s)
+        calibrate(recording, file, "joint")
+        read = skin.read(file)
+        by["single"] = Read(read, read, {})
+    rmse_n = ", ".join(f"{name} {one.touches.rmse_n():.3f}" for name, one in by.items())
+    print(f"live {task.seed}: {rmse_n}; {seconds:.0f} s", flush=True)
+    return Shown(task, by, None)
+
+
 def show(task: Task) -> Shown:
     """Knead, calibrate and touch a skin."""
+    if task.group == "live":
+        return show_live(task)
     size, scans = 8, 6000
     if task.group == "large":
         size, scans = 16, 20_000
@@ -178,6 +261,7 @@ def stated(shown: Shown) -> Iterator[float]:
 
 def of_spared(shown: Shown) -> Forces:
     """Of the cells that nobody pressed."""
+    assert shown.skin is not None
     forces, mask = shown.by["total"].touches, shown.skin.spared.reshape(shown.skin.rest.shape)
     return forces._replace(true_n=np.where(mask, forces.true_n, 0.0))
 
@@ -194,6 +278,7 @@ def spared_stated(shown: Shown) -> Iterator[float]:
 
 def left_out(shown: Shown, *, beside: bool) -> Iterator[float]:
     """For each press, beside the skin or not, whether its middle is named [%]."""
+    assert shown.skin is not None
     spans = shown.by["total"].said["left_out"]
     for press in shown.skin.presses:
         if (press.beside_n > 0) is beside:
@@ -240,10 +325,12 @@ FIGURES = [
     Figure("60_weights_tips", "weights", "60", tips, np.median, at_most, 10),
     Figure("120_weights_tips", "weights", "120", tips, np.median, at_most, 9),
     Figure("large_seconds", "large", "", said("seconds"), np.max, at_most, 300),
+    Figure("live_over_single", "live", "", over("single"), np.median, at_most, 1.3),
+    Figure("live_seconds", "live", "", said("seconds"), np.max, at_most, 150),
     Figure("large_gigabytes", "large", "", said("gigabytes"), np.max, at_most, 1),
 ]
 NAMES = {"force": list(WIRES), "weights": ["60", "120"]}
-SKINS = {"force": 3, "spared": 2, "scale": 5, "beside": 2, "weights": 3, "large": 1}
+SKINS = {"force": 3, "spared": 2, "scale": 5, "beside": 2, "weights": 3, "large": 1, "live": 3}
 
 
 def main() -> int:
