@@ -277,6 +277,7 @@ def knead(
     wires: Wires = "",
     leads: Leads = None,
     force: Force = False,
+    view: Annotated[bool, Option("--view", help="show the map on a page in the browser")] = False,
 ) -> None:
     """By pressing the skin at PORT anywhere, over a scale: shows where to press until all is known.
 
@@ -284,7 +285,7 @@ def knead(
     """
     calibrator_of = _options(out, method, None, wires_of(wires, leads), force)
     said = force_port, force_baud, force_scale, force_unit, force_column
-    given, known = kneaded(port, out, said, seconds)
+    given, known = kneaded(port, out, said, seconds, view=view)
     try:
         _learn_totals(calibrator_of, given, out)
     except ValueError as exc:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin calibrate knead``: press a skin anywhere, over a scale, until all cells are known."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from itertools import takewhile
 from pathlib import Path
 from typing import Final
@@ -18,6 +19,7 @@ from ohmskin.calibrate.sessions import check_same, session_paths
 from ohmskin.cli.board import TERMINAL, asked_for
 from ohmskin.cli.record import FORCE_TARE_S, sensor_at, unread, with_truth
 from ohmskin.cli.stream import cell_table
+from ohmskin.cli.view import browse, page_server
 from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.errors import DeviceLost, TareRefused
 from ohmskin.link.device import Device
@@ -26,20 +28,27 @@ from ohmskin.record import recorder as recording
 from ohmskin.record.force_sensor import ForceSensor
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Recording, load_recording
+from ohmskin.view.kneaded import KneadedBoard
 
 # Where no terminal shows the map, a line says how much is known, once in this time [s]. Chosen:
 # some lines a minute.
 _SAY_EVERY_S: Final = 10.0
 
 
+TOUCH_NOTHING: Final = "touch nothing yet"
+
+
 class KneadMap:
     """How well each cell is known, in the terminal, while it is recorded.
 
+    page: shows it in a browser, too.
     has_rest: whether the rest was measured to its end, and the scale stood still meanwhile.
     """
 
-    def __init__(self, recorder: Recorder, coverage: LiveCoverage) -> None:
-        self._recorder, self._coverage = recorder, coverage
+    def __init__(
+        self, recorder: Recorder, coverage: LiveCoverage, page: KneadedBoard | None = None
+    ) -> None:
+        self._recorder, self._coverage, self._page = recorder, coverage, page
         self._said_s = self._began_s = recorder.now_s()
         self.has_rest = False
 
@@ -54,6 +63,10 @@ class KneadMap:
             remedy = "touch nothing for the first seconds, and say it again"
             raise TareRefused(f"the force moved by {moved_n:.1f} N at rest", remedy)
         self.has_rest = self._recorder.tare is not None
+        if self._page is not None:
+            coverage, words = self._coverage, self.words() if self.has_rest else TOUCH_NOTHING
+            known = coverage.log_std, coverage.known, coverage.next_cell
+            self._page.show(scan, *known, words)
         if not TERMINAL.is_terminal and scan.host_time_s - self._said_s >= _SAY_EVERY_S:
             self._said_s = scan.host_time_s
             TERMINAL.print(f"{scan.host_time_s - self._began_s:.0f} s: {self.words()}")
@@ -73,7 +86,7 @@ class KneadMap:
         """All of it."""
         force, tare = self._recorder.force, self._recorder.tare
         shown = "" if force is None else f"   force {force.force_n:.2f} N"
-        doing = "touch nothing yet" if tare is None else self.words()
+        doing = TOUCH_NOTHING if tare is None else self.words()
         percent, known = 100 * self._coverage.log_std, self._coverage.known
         cells = [[Text(f"{each:.0f}") for each in row] for row in percent.tolist()]
         for at in np.ndindex(known.shape):
@@ -84,11 +97,12 @@ class KneadMap:
 
 
 def kneaded(
-    port: str, out: Path, scale: tuple[str, int, float, str, str], seconds: float
+    port: str, out: Path, scale: tuple[str, int, float, str, str], seconds: float, *, view: bool
 ) -> tuple[list[Recording], bool]:
     """What was kneaded before, and now, until all cells are known or Ctrl-C comes.
 
-    scale: as `sensor_at` takes it. Returns all recordings, and whether all cells are known.
+    scale: as `sensor_at` takes it. view: show the map on a page, too. Returns all recordings, and
+    whether all cells are known.
     """
     before, path = session_paths(out, "knead")
     recordings = [load_recording(each) for each in before]
@@ -103,7 +117,10 @@ def kneaded(
             coverage.ask_more()
         if not coverage.is_done:
             try:
-                goes_on = _knead(skin, path, sensor_at(skin, *scale), coverage, seconds)
+                with ExitStack() as stack:
+                    page = stack.enter_context(_page(port, skin)) if view else None
+                    sensor = sensor_at(skin, *scale)
+                    goes_on = _knead(skin, path, sensor, coverage, seconds, page)
             except TareRefused:
                 path.unlink()
                 raise
@@ -115,6 +132,24 @@ def kneaded(
     return recordings, coverage.is_done
 
 
+@contextmanager
+def _page(port: str, skin: Device) -> Iterator[KneadedBoard]:
+    """A page in the browser that shows the map."""
+    server = page_server()
+    from ohmskin.view.boards import ViewedBoards
+
+    boards, page = ViewedBoards(), KneadedBoard(port, skin.info)
+    boards[0] = page
+
+    def started(url: str) -> None:
+        TERMINAL.print(url)
+        browse(url)
+
+    with server.served(boards, "127.0.0.1", None, started):
+        yield page
+        page.end("it has ended: see the terminal")
+
+
 def _is_newer(out: Path, recordings: list[Path]) -> bool:
     """Whether a calibration is there that was written after these recordings."""
     written_ns = [path.stat().st_mtime_ns for path in recordings]
@@ -122,7 +157,12 @@ def _is_newer(out: Path, recordings: list[Path]) -> bool:
 
 
 def _knead(
-    skin: Device, path: Path, sensor: ForceSensor | None, coverage: LiveCoverage, seconds: float
+    skin: Device,
+    path: Path,
+    sensor: ForceSensor | None,
+    coverage: LiveCoverage,
+    seconds: float,
+    page: KneadedBoard | None,
 ) -> bool:
     """Record while somebody kneads. Returns whether it went on after the rest was measured."""
     coverage.begin()
@@ -134,7 +174,7 @@ def _knead(
             f"touch nothing for {FORCE_TARE_S:g} s, then press everywhere, softly and hard, with a "
             "finger or several; Ctrl-C ends it, and the same command goes on"
         )
-        shown = KneadMap(recorder, coverage)
+        shown = KneadMap(recorder, coverage, page)
         if TERMINAL.is_terminal:
             live = Live(get_renderable=shown.picture, console=TERMINAL, transient=True)
             stack.enter_context(live)

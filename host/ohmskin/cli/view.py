@@ -7,6 +7,7 @@ import sys
 import threading
 import webbrowser
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Final, TextIO
 
 from typer import Argument, Option
@@ -43,23 +44,15 @@ def view(
     A board that is not there, or goes, is told of, and is opened whenever it is plugged in.
     Recordings go to the current folder. Ctrl-C ends it; a recording is whole then.
     """
-    try:
-        from ohmskin.view import server
-    except ImportError as exc:
-        raise OhmskinError(
-            f"the page needs more ({exc.name}): run pip install '.[view]' in the checkout, or "
-            "'FILE.whl[view]' of a release's wheel"
-        ) from exc
+    server = page_server()
     from ohmskin.view.boards import ViewedBoards
 
     calibrations = [load_calibration(path) for path in calibration or ()]
 
     def started(url: str) -> None:
         print(url, flush=True)  # noqa: T201
-        has_display = sys.platform in ("win32", "darwin") or _DISPLAYS & {*os.environ}
-        if has_display and not no_browser:
-            # Some browsers return only when they are closed.
-            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+        if not no_browser:
+            browse(url)
 
     LOG.addHandler(told := _Told())
     try:
@@ -68,6 +61,28 @@ def view(
             server.serve(boards, host, http_port, started)
     finally:
         LOG.removeHandler(told)
+
+
+def page_server() -> ModuleType:
+    """The module that serves the page.
+
+    :raises OhmskinError: what it needs is not installed.
+    """
+    try:
+        from ohmskin.view import server
+    except ImportError as exc:
+        raise OhmskinError(
+            f"the page needs more ({exc.name}): run pip install '.[view]' in the checkout, or "
+            "'FILE.whl[view]' of a release's wheel"
+        ) from exc
+    return server
+
+
+def browse(url: str) -> None:
+    """Open a browser, where it has somewhere to open."""
+    if sys.platform in ("win32", "darwin") or _DISPLAYS & {*os.environ}:
+        # Some browsers return only when they are closed.
+        threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 
 class _Told(logging.StreamHandler[TextIO]):

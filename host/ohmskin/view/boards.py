@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The boards of the page: what a `LiveSkin` reads is shown, recorded and commanded."""
 
-import json
 import math
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,9 +13,7 @@ from importlib import import_module
 from itertools import count, takewhile
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final, NamedTuple
-
-import numpy as np
+from typing import Any, Final
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.configurations import as_near
@@ -34,6 +30,8 @@ from ohmskin.link.messages import Hello, Scan
 from ohmskin.live import LiveSkin
 from ohmskin.record.recorder import Recorder, record
 from ohmskin.record.recording import Mark, Tare
+from ohmskin.view.kneaded import KneadedBoard
+from ohmskin.view.shown import Shown, of_board
 
 # The methods that the page offers: all but those of the paper, which take minutes for an 8x8 frame.
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
@@ -50,25 +48,8 @@ LONGEST_TEXT_CHARS: Final = 1000
 # `ViewedBoard.close` waits at most so long for the end of the focus [s]. Chosen: a board answers in
 # a tenth of this time.
 _FOCUS_ENDS_S: Final = 0.5
-# Attributes of `Hello` that the page shows of a board.
-_OF_BOARD: Final = ("board", "unit_id", "version", "rows", "columns", "mode")
 # Numbers of a `Contact` that the page shows.
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
-
-
-class Shown(NamedTuple):
-    """One scan as a page shows it: its number, and the message that the page is sent.
-
-    ==============  ==================================================================
-    4 bytes         length of the header, little-endian
-    header          JSON, padded with spaces to a multiple of 4 bytes
-    planes          in the order of "planes" in the header, each R x C float32, little-endian, by
-                    row
-    ==============  ==================================================================
-    """
-
-    number: int
-    message: bytes
 
 
 def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, more: dict[str, Any]) -> Shown:
@@ -94,17 +75,13 @@ def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, more: dict[str, Any
         "host_time_s": scan.host_time_s,
         "rows": scan.rows,
         "columns": scan.columns,
-        "planes": list(planes),
         "chi2": _number(estimate.chi2),
         "estimate_s": estimate.seconds,
         "text": estimate.message,
         "wires": ASSUMED_WIRES if estimate.wires == ASSUMED else "",
         "contacts": [list(map(_number, _numbers_of(contact))) for contact in scan.contacts],
     }
-    header = json.dumps(content, allow_nan=False).encode()
-    header += b" " * (-len(header) % 4)  # a page can read planes only from a multiple of 4 bytes
-    values = np.stack(list(planes.values())).astype("<f4")
-    return Shown(scan.number, struct.pack("<I", len(header)) + header + values.tobytes())
+    return Shown.of(content, planes)
 
 
 def _number(value: float) -> float | None:
@@ -184,7 +161,7 @@ class ViewedBoard(LiveSkin):
             "status": status,
             "text": " ".join(str(self.failure or "").split()),
             "note": self._note,
-            "board": board and {name: getattr(board, name) for name in _OF_BOARD},
+            "board": board and of_board(board),
             "methods": [] if reader is None else _methods(reader),
             "method": "" if reader is None else reader.method,
             "force_method": None if reader is None else reader.force_method,
@@ -371,7 +348,7 @@ def _methods(reader: SkinReader) -> tuple[str, ...]:
     return tuple(name for name, kind in kinds.items() if kind.takes_partial or board.mode == "near")
 
 
-class ViewedBoards(Closing, dict[int, ViewedBoard]):
+class ViewedBoards(Closing, dict[int, ViewedBoard | KneadedBoard]):
     """The boards of one page, by number, from 0. `ViewedBoard` says what the arguments are."""
 
     def __init__(

@@ -20,7 +20,9 @@ from anyio.abc import TaskGroup
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from ohmskin.errors import OhmskinError, TareRefused
-from ohmskin.view.boards import Shown, ViewedBoard
+from ohmskin.view.boards import ViewedBoard
+from ohmskin.view.kneaded import KneadedBoard
+from ohmskin.view.shown import Shown
 
 # The close code of a websocket whose board was closed, by this page or by another. page/wire.js has
 # the same. Chosen: one of 4000 to 4999, which RFC 6455 leaves to programs.
@@ -37,7 +39,7 @@ _Command = Callable[[], str]
 class Panel:
     """Serves one connection until the page or the board goes."""
 
-    def __init__(self, board: ViewedBoard, socket: WebSocket) -> None:
+    def __init__(self, board: ViewedBoard | KneadedBoard, socket: WebSocket) -> None:
         self._board = board
         self._socket = socket
         self._news = asyncio.Event()
@@ -117,6 +119,8 @@ class Panel:
 
     def _asked(self, message: object) -> tuple[str, _Command] | None:
         board = self._board
+        if not isinstance(board, ViewedBoard):  # it takes no commands
+            return None
         match message:
             case {"do": "method", "method": str(method)}:
                 return "method", lambda: board.use(method)

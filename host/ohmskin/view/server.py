@@ -12,8 +12,9 @@ import mimetypes
 import re
 import secrets
 import socket
-from collections.abc import AsyncIterator, Callable, Collection
-from contextlib import asynccontextmanager
+import threading
+from collections.abc import AsyncIterator, Callable, Collection, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -212,16 +213,38 @@ def serve(
 
     :raises OhmskinError: the address cannot be had.
     """
+    with _server(boards, host, port, started) as (server, listening):
+        server.run(sockets=[listening])
+
+
+@contextmanager
+def served(
+    boards: ViewedBoards, host: str, port: int | None, started: Callable[[str], None]
+) -> Iterator[None]:
+    """As `serve`, in a thread, while the block runs."""
+    with _server(boards, host, port, started) as (server, listening):
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+        thread.start()
+        try:
+            yield
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+@contextmanager
+def _server(
+    boards: ViewedBoards, host: str, port: int | None, started: Callable[[str], None]
+) -> Iterator[tuple[Server, socket.socket]]:
+    """The server of `serve`, and where it listens."""
     with boards, _listen(host, port) as listening:
         token = secrets.token_urlsafe(16)
         name = socket.gethostname() if host in ("", "0.0.0.0", "::") else host
         name = f"[{name}]" if ":" in name else name
         url = f"http://{name}:{listening.getsockname()[1]}/?token={token}"
         app = make_app(boards, host, token, lambda: started(url))
-        with_limits = Server(
-            app, longest_message_bytes=_LONGEST_MESSAGE_BYTES, shutdown_s=_SHUTDOWN_S
-        )
-        with_limits.run(sockets=[listening])
+        limits = {"longest_message_bytes": _LONGEST_MESSAGE_BYTES, "shutdown_s": _SHUTDOWN_S}
+        yield Server(app, **limits), listening
 
 
 class Guard:

@@ -9,7 +9,12 @@ import { Connection } from "./wire.js";
 const DIGITS_EVERY_MS = 200;
 const TABLE_EVERY_MS = 1000;
 const MESSAGE_EVERY_MS = 2000;
-const QUANTITIES = { newtons: "force (N)", siemens: "conductance (µS)", ohms: "resistance (kΩ)" };
+const QUANTITIES = {
+  newtons: "force (N)",
+  siemens: "conductance (µS)",
+  ohms: "resistance (kΩ)",
+  known: "how well each cell is known (%)",
+};
 const STATUS = {
   opening: "connecting …",
   scanning: "scanning",
@@ -234,6 +239,8 @@ export class Panel {
     for (const name of Object.keys(STATUS)) {
       this.element.classList.toggle(name, state.status === name);
     }
+    this.element.classList.toggle("kneaded", Boolean(state.kneaded));
+    if (state.kneaded) say(this.find(".estimate strong"), "How well each cell is known [%]");
     const status = STATUS[state.status];
     say(this.find(".status"), state.text ? `${status}: ${state.text}` : status);
     const board = state.board;
@@ -262,9 +269,11 @@ export class Panel {
     );
     say(
       this.find(".advice"),
-      date || !board ? "" : "Press Tare while nothing touches the skin: light touches show better.",
+      date || !board || state.kneaded
+        ? ""
+        : "Press Tare while nothing touches the skin: light touches show better.",
     );
-    if (state.note || this.noted) this.notice({ text: state.note });
+    if (state.note || this.noted) this.notice({ text: state.note, good: state.kneaded });
     this.noted = Boolean(state.note);
     this.rescale();
   }
@@ -300,7 +309,10 @@ export class Panel {
   rescale() {
     const withForce =
       this.state.force_method !== null && this.state.method === this.state.force_method;
-    const there = Object.keys(QUANTITIES).filter((name) => withForce || name !== "newtons");
+    const { kneaded } = this.state;
+    const there = kneaded
+      ? ["known"]
+      : ["newtons", "siemens", "ohms"].filter((name) => withForce || name !== "newtons");
     const wanted = there.includes(this.quantity) ? this.quantity : there[0];
     options(this.find(".quantity"), there, wanted, (name) => QUANTITIES[name]);
     this.find(".full-scale").hidden = wanted !== "newtons";
@@ -323,7 +335,7 @@ export class Panel {
 
   value(cell = this.chosen) {
     const scale = this.shownScale();
-    const [value, std] = [this.scan[scale.plane][cell], this.scan[`${scale.plane}_std`][cell]];
+    const [value, std] = [this.scan[scale.plane][cell], this.scan[`${scale.plane}_std`]?.[cell]];
     return withStd(scale, value, std, this.scan.touched[cell]);
   }
 
@@ -344,7 +356,7 @@ export class Panel {
     const raw = { values: scan.raw, std: null, touched: scan.raw_touched };
     const estimate = {
       values: scan[scale.plane],
-      std: scan[`${scale.plane}_std`],
+      std: scan[`${scale.plane}_std`] ?? null,
       touched: scan.touched,
     };
     // The cell whose curve is shown, or that the keyboard has chosen.
@@ -357,8 +369,9 @@ export class Panel {
     const writes = nowMs - (this.writtenMs || 0) >= DIGITS_EVERY_MS || !this.writtenMs;
     for (const [map, itsScale, values, bar] of drawn) {
       map.draw(scan, itsScale, values, chosen);
-      if (writes && this.shows("numbers")) map.write(itsScale, values);
-      if (!this.shows("numbers")) map.texts = [];
+      const numbers = this.shows("numbers") || this.state.kneaded;
+      if (writes && numbers) map.write(itsScale, values);
+      if (!numbers) map.texts = [];
       map.drawTexts(itsScale, values);
       if (!this.barsMs) drawBar(this.find(bar), itsScale);
     }
@@ -404,6 +417,7 @@ export class Panel {
 
   // The force of each contact, or how far it is above rest: with its deviation, or briefly.
   amounts({ force, contacts }, { briefly }) {
+    if (this.state.kneaded) return ["press here"];
     const [unit, size] = force ? ["N", 1] : ["µS", 1e6];
     return contacts.map(([, , , amount, std]) => {
       if (std === null || !(std <= amount)) return "uncertain"; // null: not known
@@ -427,7 +441,12 @@ export class Panel {
     const count = (touched) => touched.reduce((sum, each) => sum + each, 0);
     const cells = (number, seem) => `${number} ${number === 1 ? "cell" : "cells"} ${seem}touched`;
     say(this.find(".raw .count"), cells(count(scan.raw_touched), "seemingly "));
-    say(this.find(".estimate .count"), `by ‘${scan.method}’: ${cells(count(scan.touched), "")}`);
+    say(
+      this.find(".estimate .count"),
+      this.state.kneaded
+        ? `${count(scan.touched)} of ${scan.rows * scan.columns} are known, outlined`
+        : `by ‘${scan.method}’: ${cells(count(scan.touched), "")}`,
+    );
     say(this.find(".chosen"), `${this.place()}, the last ten seconds`);
     say(this.find(".value"), this.value());
     this.find(".plot").setAttribute("aria-label", `Curve of cell ${this.place()} over ten seconds`);

@@ -101,10 +101,23 @@ const newtons = (top) => ({
   ticks: [0, 0.25, 0.5, 0.75, 1].map((share) => share * top),
 });
 
+// How well the cells of a skin that is kneaded are known: the better, the farther up.
+const WORST = 0.3;
+const known = {
+  name: "how well each cell is known",
+  unit: "%",
+  plane: "log_std",
+  floor: 0,
+  position: (value) => 1 - value / WORST,
+  show: (value) => 100 * value,
+  std: () => 0,
+  ticks: [0.3, 0.225, 0.15, 0.075, 0],
+};
+
 export const TOPS_N = [2, 5, 10, 20, 50];
 
 export function scaleOf(quantity, topN) {
-  return quantity === "newtons" ? newtons(topN) : quantity === "ohms" ? ohms : siemens;
+  return { newtons: newtons(topN), ohms, known }[quantity] ?? siemens;
 }
 
 // A value that may be none: its deviation is larger. It has a word in place of a number. Cells that
@@ -119,6 +132,7 @@ export const isAbove = (scale, value) => scale.position(value) > 1;
 
 export function withStd(scale, value, std, touched) {
   if (isUncertain(scale, value, std, touched)) return "uncertain";
+  if (scale === known) return `${written(scale.show(value))} %`;
   const above = isAbove(scale, value) ? ", off the scale" : "";
   const [text, spread] = writtenWith(scale.show(value), scale.std(value, std));
   return `${text} ± ${spread} ${scale.unit}${above}`;
