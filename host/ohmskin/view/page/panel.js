@@ -417,7 +417,7 @@ export class Panel {
 
   // The force of each contact, or how far it is above rest: with its deviation, or briefly.
   amounts({ force, contacts }, { briefly }) {
-    if (this.state.kneaded) return ["press here"];
+    if (contacts[0]?.[0] === "next") return ["press here"];
     const [unit, size] = force ? ["N", 1] : ["µS", 1e6];
     return contacts.map(([, , , amount, std]) => {
       if (std === null || !(std <= amount)) return "uncertain"; // null: not known
