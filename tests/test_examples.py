@@ -64,6 +64,13 @@ def test_every_scan_prints_consecutive_scans() -> None:
     assert numbers == list(range(numbers[0], numbers[0] + 5))
 
 
+def test_every_scan_refuses_what_is_no_number_of_scans() -> None:
+    """It ended in a traceback."""
+    done = python(str(EXAMPLES / "every_scan.py"), "emulator://2x2", "abc")
+    said = "every_scan: SCANS is a whole number, such as 100, not 'abc'\n"
+    assert (done.code, done.err) == (1, said)
+
+
 @pytest.mark.parametrize("name", ["every_scan", "estimate"])
 def test_ctrl_c_ends_an_example(name: str) -> None:
     [line] = first_lines(1, "-u", str(EXAMPLES / f"{name}.py"), "emulator://2x2?scene=multi")
