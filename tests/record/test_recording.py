@@ -520,6 +520,14 @@ def test_export_of_a_part(tmp_path: Path, recorded: Path) -> None:
     assert not list(tmp_path.glob("b*"))
 
 
+def test_a_part_that_ends_before_it_begins_is_refused(tmp_path: Path, recorded: Path) -> None:
+    """It was said to have no scans."""
+    with pytest.raises(
+        ValueError, match=r"cannot end after 0\.5 s, and begin after 1 s: say --beg"
+    ):
+        export(recorded, tmp_path / "a.npz", begin_s=1.0, end_s=0.5)
+
+
 def test_a_part_has_the_tare_that_held_and_the_board_that_was_there(
     path: Path, hello: Hello, tmp_path: Path
 ) -> None:

@@ -89,6 +89,7 @@ class Part:
     marks: those of the part.
     timed, watch: as `messages` takes them.
 
+    :raises ValueError: the part ends before it begins.
     :raises RecordingError: as `messages`; there are no scans, or they have not all the same size.
     """
 
@@ -103,6 +104,11 @@ class Part:
     marks: list[Mark] = field(default_factory=list)
     timed: bool = False
     watch: Callable[[int], object] | None = None
+
+    def __post_init__(self) -> None:
+        if self.end_s and self.end_s < self.begin_s:
+            text = f"a part cannot end after {self.end_s:g} s, and begin after {self.begin_s:g} s"
+            raise ValueError(f"{text}: say --begin below --end")
 
     def __iter__(self) -> Iterator[Scan]:
         self.scans, size, first_s = 0, None, math.inf
