@@ -168,6 +168,35 @@ def test_a_reset_while_stopped_does_not_undo_the_configuration() -> None:
         assert skin.info.rate_asked_mhz == 77_000
 
 
+class ResetBeforeStart(SteppedLink):
+    """Its board is reset before it hears "start", and does not hear the first "stop" after that."""
+
+    left: tuple[str, ...] = ()  # what has still to happen
+
+    def write(self, octets: bytes) -> None:
+        (frame,) = framing.Decoder().feed(octets)
+        name = protocol.FRAMES_BY_ID[frame.type].name
+        is_due = name in self.left[:1]
+        self.left = self.left[is_due:]
+        if is_due and name == "start":
+            self.board.reset()
+        if not is_due or name == "start":
+            super().write(octets)
+
+
+def test_a_reset_right_before_start_gives_no_scans_of_another_configuration() -> None:
+    """Those that came before the board was stopped again were kept for iterators."""
+    link = ResetBeforeStart(emulated("emulator://4x4")[0])
+    with SteppedSkin(link) as skin:
+        skin.configure(rows=2, mode="half")
+        link.left = "start", "stop"
+        found = list(itertools.islice(skin, 5))
+        assert not link.left
+    assert [(scan.number, scan.mode, scan.codes.shape) for scan in found] == [
+        (number, "half", (2, 4, 2)) for number in range(5)
+    ]
+
+
 def test_a_stall_of_two_seconds() -> None:
     with stepped("emulator://2x2?rate=200&stall=2") as skin:
         scans = iter(skin)

@@ -250,7 +250,8 @@ class Session(Device):
             case Scan() if self._want_scans and _size(message) != _size(self.info):
                 said = f"{_size(self.info)} cells, its scans have {_size(message)}"
                 raise ProtocolError(f"{self.name}: hello says {said}", _BROKEN)
-            case Scan() if self._hello is not None:
+            # A board that was reset right before "start" scans in its own way until it is stopped.
+            case Scan() if self._hello is not None and (self._want_scans or self._is_as_wanted()):
                 timed = replace(message, delay_s=self._clock.board.delay_s)
                 time_ns = self._clock.time_ns(timed, self._hello)
                 self._publish(replace(timed, time_ns=time_ns))
