@@ -109,6 +109,12 @@ def test_a_recording_and_its_forces_make_a_calibration(
     np.testing.assert_allclose(*slopes, rtol=0.02)
 
 
+def test_the_lead_that_was_told_is_said(run: Run, presses: tuple[Path, Path, Path]) -> None:
+    """Presses never doubt it, so one that was told in kilohm was kept in silence."""
+    done = well(calibrate(run, presses, "--rest", "1.5", "--leads", "0.08"))
+    assert "; leads of 0.08 ohm, as told\n" in done.out
+
+
 @pytest.mark.parametrize("method", ["joint", "touch"])
 def test_presses_that_far_ends_have_read(
     run: Run, presses: tuple[Path, Path, Path], method: str

@@ -510,8 +510,10 @@ def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
         )
         return f"wires are not known, and {why}: forces' standard deviations are wide"
     line = f"wires: {wires.top:.0f} and {wires.bottom:.0f} ohm a segment"
+    lead_ohm = wires.lead if found is None else found.told.lead
+    leads = "" if lead_ohm is None else f"; leads of {lead_ohm:g} ohm, as told"
     if wires.top_log_std is None or wires.bottom_log_std is None:
-        return f"{line}, as told"
+        return f"{line}, as told{leads}"
     percent = [f"{100 * std:.0f} %" for std in (wires.top_log_std, wires.bottom_log_std)]
     source = "far ends" if found is None else f"{found.presses} presses"
     line += f" by {source}, {' and '.join(dict.fromkeys(percent))}"
@@ -520,6 +522,7 @@ def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
     if found.told.both is not None:
         words = "they disagree" if found.disagrees else "they agree"
         line += f"; told: {found.told.top:g}, {found.told.bottom:g}: {words}"
+    line += leads
     if found.unclear:
         layers = " and ".join(found.unclear)
         line += (
