@@ -321,6 +321,8 @@ def test_the_demo_writes_the_picture_that_it_names(run: Run, tmp_path: Path) -> 
     done = run("demo", "--seconds", "0.1", "--picture", str(tmp_path / "no" / "demo.png"))
     assert done.code == 2
     assert "demo.png: cannot be written: say a file in a directory there is" in done.err
+    done = run("demo", "--seconds", "0.1", "--picture", str(tmp_path / "demo.txt"))
+    assert "demo.txt: no picture ends in '.txt': say .png, .svg or .pdf" in done.err
 
 
 def test_nothing_listens_on_the_network(command: Command) -> None:

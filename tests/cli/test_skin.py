@@ -61,6 +61,7 @@ def test_a_pitch_is_two_numbers(file: Path, run: Run, pitch: str) -> None:
         (("--frame", "palm"), "nobody has said where the cells are: say --pitch-mm"),
         (("--picture", "p.svg"), "nobody has said where the cells are: say --pitch-mm"),
         (("--pitch-mm", "10,10", "--picture", "/no/such/p.svg"), "/no/such/p.svg: cannot"),
+        (("--pitch-mm", "10,10", "--picture", "p.txt"), "p.txt: no picture ends in '.txt': say"),
         (("--pitch-mm", "0,10"), "--pitch-mm wants two numbers above 0, as 10,10, not '0,10'"),
         (("--pitch-mm", "-1,10"), "--pitch-mm wants two numbers above 0, as 10,10, not '-1,10'"),
         (("--pitch-mm", "10,10", "--radius-mm", "5"), "8 columns of 0.01 m go round more than"),

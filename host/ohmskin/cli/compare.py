@@ -10,7 +10,7 @@ from rich.columns import Columns
 
 import ohmskin
 from ohmskin.arrays import FULL_SCALE_USIEMENS, Bool, Float
-from ohmskin.cli.picture import picture
+from ohmskin.cli.picture import check_picture, picture
 from ohmskin.cli.record import progress
 from ohmskin.cli.stream import WIDE, coloured
 from ohmskin.cli.terminal import Terminal
@@ -18,7 +18,6 @@ from ohmskin.emulate.urls import emulated
 from ohmskin.errors import OhmskinError
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
-from ohmskin.files import check_place
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.device import scans_for
 
@@ -29,7 +28,7 @@ _out = Terminal()
 
 def compare(port: str, seconds: float, path: Path) -> None:
     """Scan an emulated board, print truth and estimates, and write a picture of them."""
-    check_place(path)
+    check_picture(path)
     _, scene, _ = emulated(port)
     with ohmskin.open(port) as skin:
         board = skin.info

@@ -2,15 +2,25 @@
 """Pictures that commands write, drawn by matplotlib, which the extra `plot` installs."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ohmskin.errors import OhmskinError
-from ohmskin.files import whole_file
+from ohmskin.files import check_place, whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+def check_picture(path: Path, *inputs: Path | None) -> None:
+    """As `check_place`; raises ValueError, too, for an ending that no picture has."""
+    check_place(path, *inputs)
+    with suppress(ImportError):  # `picture` says what is missing
+        from matplotlib.backend_bases import FigureCanvasBase
+
+        if path.suffix[1:].lower() not in ("", *FigureCanvasBase.get_supported_filetypes()):
+            raise ValueError(f"{path}: no picture ends in '{path.suffix}': say .png, .svg or .pdf")
 
 
 @contextmanager

@@ -10,8 +10,7 @@ import numpy as np
 from typer import Argument, Option
 
 from ohmskin.cli.board import TERMINAL
-from ohmskin.cli.picture import picture
-from ohmskin.files import check_place
+from ohmskin.cli.picture import check_picture, picture
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.geometry import Geometry
 
@@ -37,7 +36,7 @@ def skin(
     if known.geometry is None and (frame or drawing) and not (taxels or pitch_mm or radius_mm):
         raise ValueError("nobody has said where the cells are: say --pitch-mm 10,10, too")
     if drawing is not None:
-        check_place(drawing, file)
+        check_picture(drawing, file)
     placed, frame = known.geometry, frame or (known.geometry.frame_id if known.geometry else "skin")
     if taxels is not None:
         placed = Geometry.of_file(taxels, known.rows, known.columns, frame)

@@ -15,7 +15,7 @@ from ohmskin.circuit.plate import load_plate
 from ohmskin.cli.board import Leads, Port, Wires, wires_of
 from ohmskin.cli.doctor import as_object, print_page, terminal
 from ohmskin.cli.doctor_words import line_in_words
-from ohmskin.cli.picture import picture
+from ohmskin.cli.picture import check_picture, picture
 from ohmskin.cli.stream import numbers
 from ohmskin.cli.terminal import Terminal
 from ohmskin.doctor.examine import examine
@@ -60,9 +60,10 @@ def verify(
     settled, noise by ADC clock, and lost scans. Leaves the board as it was. Exit code 0: all is
     within the tolerances; 1: something is not.
     """
-    for path, ending in ((str(png or ""), ""), (json_file.removeprefix("-"), ".json")):
-        if path:
-            check_place(Path(path), plate, ending=ending)
+    if png is not None:
+        check_picture(png, plate)
+    if json_file not in ("", "-"):
+        check_place(Path(json_file), plate, ending=".json")
     tolerance = Tolerance(cell_percent, reference_percent, settling_lsb)
     exam = PlateExam(load_plate(plate), wires_of(wires, leads), tolerance)
     with terminal() as report, ohmskin.open(port, start=False) as device:
