@@ -428,6 +428,12 @@ def test_a_time_below_0_is_refused(run: Run, arguments: tuple[str, ...]) -> None
             assert_one_line(run(*arguments, option, value), option)
 
 
+def test_any_number_of_scans_may_be_asked_for(run: Run) -> None:
+    """One that Python counts no scans by was an error, after the file was begun."""
+    port, limits = f"{EMULATED}&speed=0", ("--scans", 30 * "9", "--seconds", "0.05")
+    assert len(well(run("stream", port, "--json", *limits)).out.splitlines()) == 6
+
+
 def test_a_demo_ends(run: Run) -> None:
     assert_one_line(run("demo", "--seconds", "0"), "--seconds")
 

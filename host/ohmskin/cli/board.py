@@ -62,7 +62,7 @@ Seconds = Annotated[float, Option(min=0, help="stop after so long; 0: never")]
 
 def asked_for(scans: Iterable[Scan], count: int, seconds: float) -> Iterator[Scan]:
     """The scans that the options `Scans` and `Seconds` ask for."""
-    return islice(scans_for(scans, seconds or math.inf), count or None)
+    return islice(scans_for(scans, seconds or math.inf), min(count, sys.maxsize) or None)
 
 
 def wires_of(text: str, lead_ohm: float | None) -> WireOhm:
