@@ -404,6 +404,13 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
         ["--force-port"],
     ),
     "a recording as a port": (["stream", __file__ + ".mcap"], [f"replay://{__file__}.mcap"]),
+    "more weights than there is memory": (
+        [
+            *("calibrate", "weights", EMULATED, "/tmp/never.json", "--anywhere"),
+            *("--grams", "50,100", "--repeats", "1000000000000000"),
+        ],
+        ["--repeats"],
+    ),
     "missing option": (["estimate", READINGS], ["--method"]),
     "not a number": (["stream", EMULATED, "--scans", "many"], ["--scans"]),
 }

@@ -98,7 +98,8 @@ def weights(
         bool, Option("--anywhere", help="put each weight at some places, not on single cells")
     ] = False,
     repeats: Annotated[
-        int | None, Option(min=1, help="times each weight is put on each cell: 2, anywhere 20")
+        int | None,
+        Option(min=1, max=1000, help="times each weight is put on each cell: 2, anywhere 20"),
     ] = None,
     cells: Annotated[str, Option(help="row,column of each, '0,0 0,1'; default: all")] = "",
     redo: Annotated[list[str] | None, Option(help="row,column: drop its presses first")] = None,
