@@ -111,6 +111,8 @@ def _device(text: str) -> Device:
             from ohmskin.record.replay import Replay
 
             url.check_options("speed")
+            if not url.place:
+                raise PortError(f"{text} names no recording: write replay://FILE.mcap")
             with url.blamed():
                 return Replay(url.place, url.number("speed", 1.0), text)
     kinds = "serial ports by name, socket://, rfc2217://, emulator://, simavr:// and replay://"

@@ -404,6 +404,7 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
         ["--force-port"],
     ),
     "a recording as a port": (["stream", __file__ + ".mcap"], [f"replay://{__file__}.mcap"]),
+    "no recording": (["stream", "replay://"], ["replay:// names no recording: write replay://FI"]),
     "more weights than there is memory": (
         [
             *("calibrate", "weights", EMULATED, "/tmp/never.json", "--anywhere"),
