@@ -10,13 +10,14 @@ Symbols
 symbol shape   meaning                                                                   unit
 ====== ======= ========================================================================= =======
 u      (2,)    logs of a top and of a bottom segment                                     1
-L              -log of how likely the total forces are (`TotalFit.misfit`), for a press    1
+w      (2,)    change of a top and of a bottom segment, as a share of itself             1
+L              -log of how likely the total forces are (`TotalFit.misfit`), for a press  1
 ====== ======= ========================================================================= =======
 
 In a trial, the wires are held at some u, an estimator shows the scans, and a `TotalFit` has L. It
-also tells by which shares w of themselves the segments should change (`TotalFit.wires`). Presses
-tell ohms, so the next trial is at u + log(1 + w). If its L is larger, that was too far, and half
-of the way is tried.
+also tells w (`TotalFit.wires`). Presses tell ohms, so the next trial is at u + log(1 + w), or at
+u + w where segments become smaller: then 1 + w may be below 0. If its L is larger by more than
+`LIKELY` for all presses together, that was too far, and half of the way is tried.
 
 Few presses tell little of the wires, so what is taken at last is no maximum but the mean of all
 wires that they do not exclude (`likely_wires`). Behind wires that are too large, the cells under
@@ -41,8 +42,9 @@ from ohmskin.estimate.prior import USUAL_LEAD_STD_OHM
 # A trial takes as many scans as have about so many cells together: the first number in the first
 # trials, the second one after a short step. Chosen: 16x16 cells then take some minutes.
 FIRST_CELLS, TRIAL_CELLS = 60_000, 240_000
-# There are at most so many trials with either number of scans. The steps are logs: the longest one
-# that is taken, the one below which trials take more cells, and the one below which they end.
+# After the first trial with either number of scans there are at most so many others, and so many of
+# the mean. The steps are logs: the longest one that is taken, the one below which trials take more
+# cells, and the one below which they end.
 TRIALS, LONGEST_STEP, SHORT_STEP, LAST_STEP = 6, 1.5, 0.5, 0.1
 # Trials also end at a step below so many standard deviations of the wires, with the first number of
 # scans and with the second. Chosen: the presses do not tell the wires better.
@@ -177,11 +179,11 @@ def likely_wires(
 ) -> tuple[Float, Float]:
     """Mean and standard deviation of the logs of the segments, each (2,).
 
-    held: w for which the rises were estimated. step, covariance: what a fit with the prior found.
-    centre, std: of that prior.
+    held: u for which the rises were estimated. step, covariance: w, by a fit with the prior.
+    centre, std: of the prior of u.
 
     Presses tell ohms: what they say is normal about the segments themselves, and the prior about
-    their logs. So where presses tell little, w of most likelihood is far above the mean: what they
+    their logs. So where presses tell little, u of most likelihood is far above the mean: what they
     cannot exclude reaches up to the largest segments, but down to none.
     """
     prior = np.diag(std**-2.0)

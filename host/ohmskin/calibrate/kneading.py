@@ -11,15 +11,15 @@ symbol shape   meaning                                                          
 ====== ======= ========================================================================= =======
 x      (n, C)  rise of each cell above rest, by an estimator that is told the wires      S
 g      (n, C)  conductance of each cell                                                  S
-w      (2,)    logs of a top and of a bottom segment                                     1
+u      (2,)    logs of a top and of a bottom segment                                     1
 A, B           slopes of the ports' currents, over their noise: A by log g of the pressed
-               cells, B by w
+               cells, B by u
 ====== ======= ========================================================================= =======
 
 The measured currents of the ports are the same, whatever wires are believed. So if the believed
-wires change by dw, the estimated cells must change so that the currents stay:
+wires change by du, the estimated cells must change so that the currents stay:
 
-    d log g = -(A^T A + 1 / 3^2)^-1 A^T B dw ,    d log x = (g / x) d log g .
+    d log g = -(A^T A + 1 / 3^2)^-1 A^T B du ,    d log x = (g / x) d log g .
 
 3 is the deviation that a touch may have (`UNLIMITED_STD`); without it, cells that the currents
 hardly show would change without limit.
@@ -61,7 +61,7 @@ STRETCH: Final = 12
 # enough for a median.
 PAUSE_SCANS: Final = 200
 # A rise below so many times the largest one of a usual pause counts as none. Chosen: errors in
-# pauses are seldom twice as large.
+# pauses are seldom twice as large. A rise above `TOUCH_SIEMENS` always counts.
 PAUSE_TIMES: Final = 2.0
 # While a board is reset, nobody sees what presses the skin. The scale still shows it for so long
 # after this gap of the scans [s]. Chosen: the slowest scales need it.
@@ -240,7 +240,7 @@ class Kneading:
 
     @one_blas_thread
     def _slopes(self, wires: WireOhm, levels: _Levels) -> Float:
-        """d log x / dw of the module's equations, (2, n, C), of the scans that were used."""
+        """d log x / du of the module's equations, (2, n, C), of the scans that were used."""
         knowledge = self._calibrator.knowledge
         assert wires.both is not None
         series_ohm = knowledge.ref_ohm + 2 * (wires.lead or 0.0)

@@ -148,11 +148,12 @@ class PressReadings(NamedTuple):
 class FoundWires:
     """What presses tell of the wires, together with what was told.
 
-    wires: the most likely ones, with their deviations.
+    wires: the most likely ones, or the mean of a kneaded skin's, with their deviations.
     told: what was told before.
     presses: how many presses there were.
     unclear: layers whose wires are not clear: the deviation of their log is above `UNCLEAR_LOG`,
-        and the longest line is uncertain by more ohms than the hardest touch has.
+        and the longest line is uncertain by more ohms than the hardest touch has. Those of a
+        kneaded skin are not judged.
     """
 
     wires: WireOhm
