@@ -114,6 +114,13 @@ def test_wires_that_were_told_are_evidence() -> None:
     assert sure.bottom == pytest.approx(200, rel=0.15)
 
 
+def test_a_layer_that_was_told_alone_is_held_as_told_at_first() -> None:
+    """It began at 50 ohm, like one that nobody has told."""
+    skin = Skin(1000.0, 200.0)
+    WireSearch(WireOhm(top=1000.0, top_log_std=0.05), skin.show).found()
+    assert skin.believed[0] == pytest.approx((1000, 50))
+
+
 @pytest.mark.parametrize(("ohm", "std_ohm"), [(100.0, 5.0), (500.0, 250.0), (200.0, 400.0)])
 def test_wires_are_a_mean_of_what_presses_do_not_exclude(ohm: float, std_ohm: float) -> None:
     """Two layers of which presses tell this in ohms, and whose logs were expected about 150 ohm."""

@@ -116,9 +116,8 @@ class WireSearch:
 
     def found(self) -> FoundWires:
         """The wires. Raises ValueError where the force does not follow the skin."""
-        start = self._centre
-        if self._told.both is None:
-            start = np.minimum(start, np.log(START_OHM))
+        is_told = [ohm is not None for ohm in self._told[:2]]
+        start = np.where(is_told, self._centre, np.minimum(self._centre, np.log(START_OHM)))
         best = self._nearest(self._trial(start, None), SHORT_STEP, CLOSE_STDS[0])
         # L of more scans is not to be compared with that before, nor L of another filter.
         self._most_cells = TRIAL_CELLS
