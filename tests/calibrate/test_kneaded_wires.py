@@ -121,6 +121,20 @@ def test_a_layer_that_was_told_alone_is_held_as_told_at_first() -> None:
     assert skin.believed[0] == pytest.approx((1000, 50))
 
 
+def test_the_lead_is_that_of_the_wires_that_are_found() -> None:
+    """It was that of the trial before the mean of the wires."""
+    skin = Skin(100.0, 200.0, noise=0.3)
+
+    def show(wires: WireOhm, most_cells: int) -> Shown:
+        shown = skin.show(wires, most_cells)
+        return shown._replace(wires=wires._replace(lead=sum(skin.believed[-1])))
+
+    found = WireSearch(NO_WIRES, show).found().wires
+    assert found.both == pytest.approx(skin.believed[-1])  # the mean, which was tried
+    assert found.lead == pytest.approx(sum(skin.believed[-1]))
+    assert found.lead != pytest.approx(sum(skin.believed[-2]), rel=0.02)
+
+
 @pytest.mark.parametrize(("ohm", "std_ohm"), [(100.0, 5.0), (500.0, 250.0), (200.0, 400.0)])
 def test_wires_are_a_mean_of_what_presses_do_not_exclude(ohm: float, std_ohm: float) -> None:
     """Two layers of which presses tell this in ohms, and whose logs were expected about 150 ohm."""

@@ -126,7 +126,8 @@ class WireSearch:
         best = self._nearest(best, LAST_STEP, CLOSE_STDS[1])
         u, stds = likely_wires(best.held, best.change, best.covariance, self._centre, self._std)
         if np.abs(u - best.held).max() > LAST_STEP:
-            u = self._tried(u, best, TRIALS)[0].held
+            best, _ = self._tried(u, best, TRIALS)
+            u = best.held
         (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(u).tolist(), stds.tolist()
         lead = best.wires.lead, best.wires.lead_std_ohm
         wires = WireOhm(top_ohm, bottom_ohm, lead[0], top_std, bottom_std, lead[1])
