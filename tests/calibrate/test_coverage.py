@@ -92,6 +92,24 @@ def test_a_recording_is_looked_at_as_it_was_live(tmp_path: Path) -> None:
     assert live.numbers_left > 0  # it has seen some presses alone
 
 
+def test_numbers_of_a_gap_of_the_scans_tell_nothing(tmp_path: Path) -> None:
+    """All 600 of a minute counted as of the scan after it, and no more were asked for."""
+    given = record_kneading(tmp_path / "a.mcap", 8.0, 1)
+    gap_s = max(given.forces, key=lambda force: force.force_n).host_time_s
+    before, after = LiveCoverage(given.hellos[0]), LiveCoverage(given.hellos[0])
+    before.look_at(given)
+    for each in (given.scans, given.forces):
+        each[:] = [
+            replace(one, host_time_s=one.host_time_s + 60.0 * (one.host_time_s >= gap_s))
+            for one in each
+        ]
+    meanwhile = [ForceSample(8.0, gap_s + 0.1 * number) for number in range(600)]
+    given.forces = sorted([*given.forces, *meanwhile], key=lambda force: force.host_time_s)
+    after.look_at(given)
+    assert after.numbers_left == pytest.approx(before.numbers_left, abs=1)
+    np.testing.assert_allclose(after.log_std, before.log_std, rtol=0.05)
+
+
 def test_a_scale_that_is_upside_down_is_noticed(tmp_path: Path) -> None:
     """No number counted, and whoever kneaded waited for ever."""
     recording = record_kneading(tmp_path / "a.mcap", 12.0, 1)

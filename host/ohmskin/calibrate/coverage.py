@@ -26,6 +26,7 @@ far the force is from what a curve predicts. So it is known before any curve is 
 theory of the design of experiments.
 """
 
+from bisect import bisect_right
 from dataclasses import replace
 from typing import Final
 
@@ -157,11 +158,12 @@ class LiveCoverage:
         self.begin()
         if not (recording.scans and recording.tares):
             return
-        tare, times_s = recording.tares[0], [scan.host_time_s for scan in recording.scans]
-        for sample in recording.forces:
-            near = min(int(np.searchsorted(times_s, sample.host_time_s)), len(times_s) - 1)
-            is_later = sample.host_time_s > tare.host_time_s
-            self.look(recording.scans[near], tare if is_later else None, sample)
+        tare, times_s = recording.tares[0], [sample.host_time_s for sample in recording.forces]
+        for scan in recording.scans:
+            shown = bisect_right(times_s, scan.host_time_s)
+            is_later = scan.host_time_s > tare.host_time_s
+            sample = recording.forces[shown - 1] if shown else None
+            self.look(scan, tare if is_later else None, sample)
 
     @property
     def moved_n(self) -> float:
