@@ -164,6 +164,17 @@ def test_an_early_ctrl_c_is_no_error_and_kneading_goes_on(
     assert out.exists()
 
 
+def test_a_skin_that_cannot_be_read_is_not_known_and_says_why(run: Run, tmp_path: Path) -> None:
+    """Its other cells came out as known, and then no press was there to learn from."""
+    port, out = "emulator://3x3?speed=0&rate=20&scene=knead&begin=3&open_row=1", tmp_path / "a.json"
+    done = run("calibrate", "knead", port, str(out), *TRUTH, "--seconds", "12")
+    assert "0 of 9 cells are known to 15 %, the wires need 72 more numbers" in done.out
+    why = (
+        "no press can be read (row 1 conducted nothing at rest: is it open?): 'ohmskin doctor PORT'"
+    )
+    assert_one_line(done._replace(out=""), why)
+
+
 def test_fingertips_wait_until_somebody_reads() -> None:
     """Else a slow start of the command would measure the rest under them."""
     with ohmskin.open(f"{SKIN}&scene=knead", start=False) as skin:

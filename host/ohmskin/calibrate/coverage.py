@@ -142,7 +142,7 @@ class LiveCoverage:
             return False
         frame = self._estimator.estimate(scan.ratio)
         rise = np.where(frame.touched, frame.level - self._estimator.rest_level(), 0.0)
-        if not (rise > 0).any():
+        if not (frame.converged and (rise > 0).any()):
             return False
         if force_n < 0:
             self._below += 1

@@ -182,7 +182,7 @@ class Kneading:
         cells, estimator = self.shape[0] * self.shape[1], self._calibrator.estimator
         rise, good = np.zeros((used.size, cells)), used.copy()
         rests = np.zeros((len(self._knowledge), cells))
-        numbers = np.flatnonzero(wanted)
+        numbers, doubt = np.flatnonzero(wanted), ""
         scans = zip(numbers, progress([self._scans[n] for n in numbers]), strict=True)
         for recording, given in groupby(scans, lambda scan: self._recording[scan[0]]):
             knowledge = replace(self._knowledge[recording], nominal_wire_ohm=wires)
@@ -191,9 +191,14 @@ class Kneading:
             for n, scan in given:
                 answer = estimator.estimate(scan.ratio)
                 good[n], rise[n] = answer.converged, answer.level.ravel() - rest
+                doubt = answer.message or doubt
             # Levels of all recordings are of one curve. What far ends show is no part of it.
             learned = estimator.wires()
             wires = learned if self._calibrator.shows_wires else learned.for_curves_of(wires)
+        read = wanted & pressed
+        if read.any() and not good[read].any():
+            remedy = "'ohmskin doctor PORT' looks for the cause"
+            raise ValueError(f"no press can be read ({doubt}): {remedy}")
         of_nothing = rise[good & wanted & ~pressed].max(axis=1, initial=0.0)
         least = PAUSE_TIMES * float(np.median(of_nothing)) if of_nothing.size else 0.0
         rise[(rise < min(least, TOUCH_SIEMENS)) | ~pressed[:, None]] = 0.0
