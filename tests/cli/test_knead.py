@@ -175,6 +175,21 @@ def test_a_skin_that_cannot_be_read_is_not_known_and_says_why(run: Run, tmp_path
     assert_one_line(done._replace(out=""), why)
 
 
+def test_a_scale_that_is_upside_down_teaches_nothing(run: Run, tmp_path: Path) -> None:
+    """No press was kept, and it ended with a division by zero."""
+    out, path = tmp_path / "skin.json", tmp_path / "skin.knead-1.mcap"
+    port = f"{SKIN}&scene=knead&begin=3"
+    well(run("calibrate", "knead", port, str(out), *TRUTH, "--seconds", "11"))
+    given, turned = load_recording(path), tmp_path / "turned.mcap"
+    with Recorder(turned, given.hellos[0]) as recorder:
+        for message in [*given.tares, *given.scans]:
+            recorder.add(message)
+        for force in given.forces:
+            recorder.add(replace(force, force_n=-force.force_n))
+    done = run("calibrate", "recording", str(turned), str(out), "--total")
+    assert_one_line(done, "the total force does not follow the skin")
+
+
 def test_fingertips_wait_until_somebody_reads() -> None:
     """Else a slow start of the command would measure the rest under them."""
     with ohmskin.open(f"{SKIN}&scene=knead", start=False) as skin:

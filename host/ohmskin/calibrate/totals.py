@@ -290,7 +290,7 @@ class TotalFit:
                 self._fit_scale()
             self._step()
             self._judge(trims=number >= ROBUST_ROUNDS)
-        if not (self._for_wires or self.residual_share() < MOST_SHARE):
+        if not self.presses or not (self._for_wires or self.residual_share() < MOST_SHARE):
             raise ValueError(STRANGE)
         return self
 
