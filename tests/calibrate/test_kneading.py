@@ -16,7 +16,7 @@ from command_line import Run, assert_one_line, well
 from kneaded_skin import KneadedSkin
 from kneaded_skin import Scale as ScaleBelow
 from ohmskin.arrays import Float
-from ohmskin.calibrate import kneading
+from ohmskin.calibrate import kneaded_wires, kneading
 from ohmskin.calibrate.kneading import Kneading
 from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.scale import Scale, fit_scale, printed_s, wrong_numbers
@@ -329,6 +329,20 @@ def test_forces_while_the_board_was_reset_teach_nothing(
     changed(recording, scans=scans[:1200] + after, forces=given.forces)
     learned(run, recording, out)
     assert skin.read_tips(out).rmse_n() < 0.15
+
+
+def test_wires_are_looked_for_among_presses_that_were_weighed(
+    skin: KneadedSkin, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trials took the first presses alone, which were not weighed, and so nothing was learned."""
+    for cells in ("FIRST_CELLS", "TRIAL_CELLS"):
+        monkeypatch.setattr(kneaded_wires, cells, 1500)  # as on a large skin: a few presses
+    recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
+    skin.record_kneading(recording, ScaleBelow(10.0, 0.05, 0.1, 0.01, 0.1))
+    given = load_recording(recording)
+    weighed = [force for force in given.forces if not 1.0 < force.host_time_s < 15.0]
+    changed(recording, forces=weighed)
+    assert learned(run, recording, out)["presses"] > 40
 
 
 def test_wrong_numbers_of_the_scale_are_left_out(

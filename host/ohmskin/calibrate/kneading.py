@@ -153,18 +153,20 @@ class Kneading:
         is_edge[1:] |= is_edge[:-1]
         return np.asarray(self._is_clear & ((self._press < 0) | is_edge | (counts % every == 0)))
 
-    def _in_stretches(self, most_cells: int) -> Bool:
-        """Which scans to use, (n,): those of `_spaced` in some stretches of presses.
+    def _in_stretches(self, log: ForceLog, most_cells: int) -> Bool:
+        """Which scans to use, (n,): those of `_spaced` in some stretches of presses of known force.
 
         most_cells: the cells of all these scans together are about as many at most.
         """
-        used, press = self._spaced(), np.maximum.accumulate(self._press)
-        cells = int(np.count_nonzero(used & (self._press >= 0))) * self.shape[0] * self.shape[1]
-        return np.asarray(used & (press // STRETCH % (cells // most_cells + 1) == 0))
+        press = np.where(np.isfinite(log.at(self.time_s)), self._press, -1)
+        used = self._spaced() & (press == self._press)
+        cells = int(np.count_nonzero(used & (press >= 0))) * self.shape[0] * self.shape[1]
+        count = np.cumsum(np.diff(np.maximum.accumulate(press), prepend=-1) > 0) - 1
+        return np.asarray(used & (count // STRETCH % (cells // most_cells + 1) == 0))
 
     def _shown(self, log: ForceLog, wires: WireOhm, most_cells: int) -> Shown:
         """What these wires make of some stretches of presses."""
-        levels = self._levels(DEFAULT_METHOD, wires, self._in_stretches(most_cells))
+        levels = self._levels(DEFAULT_METHOD, wires, self._in_stretches(log, most_cells))
         wires = levels.estimator.wires()
         return Shown(self._totals(levels, log), self._slopes(wires, levels), wires)
 
