@@ -331,6 +331,18 @@ def test_forces_while_the_board_was_reset_teach_nothing(
     assert skin.read_tips(out).rmse_n() < 0.15
 
 
+def test_a_recording_of_one_scan_has_too_few_presses(
+    skin: KneadedSkin, run: Run, tmp_path: Path
+) -> None:
+    """A step from scan to scan was asked for: 'cannot convert float NaN to integer'."""
+    recording, out = tmp_path / "knead.mcap", tmp_path / "skin.json"
+    skin.record_kneading(recording, ScaleBelow(10.0))
+    given = load_recording(recording)
+    changed(recording, scans=given.scans[:1], forces=given.forces)
+    done = run("calibrate", "recording", str(recording), str(out), "--total")
+    assert_one_line(done, "fewer than 5 presses of the skin while it was weighed")
+
+
 def test_wires_are_looked_for_among_presses_that_were_weighed(
     skin: KneadedSkin, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -36,7 +36,7 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.kneaded_wires import Shown, WireSearch, held
 from ohmskin.calibrate.presses import Calibrator, Progress, number_presses
 from ohmskin.calibrate.tables import ForceLog, gaps
-from ohmskin.calibrate.totals import TotalFit, Totals
+from ohmskin.calibrate.totals import TotalFit, Totals, check_weighed
 from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.small import one_blas_thread, solve_positive
 from ohmskin.estimate.base import TOUCH_SIEMENS, Estimator
@@ -126,6 +126,7 @@ class Kneading:
         lags: as in `Totals`. A scale that does not lag shows the force of some scans, such as
             known weights do: then only scans whose force is known are used.
         """
+        check_weighed(int(self._press.max()) + 1)
         calibrator = self._calibrator
         if not lags:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)

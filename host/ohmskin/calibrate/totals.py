@@ -201,7 +201,7 @@ class TotalFit:
         cells = totals.rise.shape[1]
         self.scale_ = scale or Scale()
         self._on = (totals.rise > 0) & (totals.press >= 0)[:, None]
-        _check_enough(np.unique(totals.press[self._on.any(axis=1)]).size)
+        check_weighed(np.unique(totals.press[self._on.any(axis=1)]).size)
         self._unit = float(np.exp(np.mean(np.log(totals.rise[self._on]))))  # x0
         self._hard = float(np.quantile(totals.rise[self._on], HARD_QUANTILE))
         self._log_x = np.log(np.where(self._on, totals.rise, self._unit) / self._unit)
@@ -216,7 +216,7 @@ class TotalFit:
         self._p[1:3] = EXPONENT, SERIES
         self._gain_std = FIRST_GAIN_STD
         self._group()
-        _check_enough(int(np.count_nonzero(self._is_press)))
+        check_weighed(int(np.count_nonzero(self._is_press)))
         self._out: Bool = np.zeros(self._groups, dtype=bool)
         self._trust: Float = np.ones(self._groups)
 
@@ -528,7 +528,8 @@ class TotalFit:
         return float(np.sqrt(np.mean((self.off_n_[good] / size_n[good]) ** 2) + by_play**2))
 
 
-def _check_enough(presses: int) -> None:
+def check_weighed(presses: int) -> None:
+    """Raise ValueError where these are too few."""
     if presses < MIN_PRESSES:
         raise ValueError(f"fewer than {MIN_PRESSES} presses of the skin while it was weighed")
 
