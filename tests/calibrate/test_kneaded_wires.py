@@ -8,7 +8,13 @@ import pytest
 from scipy.integrate import quad
 
 from ohmskin.arrays import Float
-from ohmskin.calibrate.kneaded_wires import Shown, WireSearch, likely_wires
+from ohmskin.calibrate.kneaded_wires import (
+    LIKELY,
+    TRIAL_CELLS,
+    Shown,
+    WireSearch,
+    likely_wires,
+)
 from ohmskin.calibrate.scale import Scale
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
@@ -101,6 +107,34 @@ def test_a_step_that_is_too_long_is_halved(monkeypatch: pytest.MonkeyPatch) -> N
     assert max(bottom for _, bottom in skin.believed) > 350  # a step went too far
     assert found.top == pytest.approx(100, rel=0.4)
     assert found.bottom == pytest.approx(200, rel=0.4)
+
+
+def test_a_step_that_was_too_long_is_not_taken_with_more_scans(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It was refused, halved and refused, and then taken whole, with nothing to compare it with."""
+    skin, usual, usual_misfit = Skin(100.0, 200.0), TotalFit.wires, TotalFit.misfit
+    cells: list[int] = []
+    misfits: list[float] = []
+
+    def overdone(fit: TotalFit, slopes: WireSlopes) -> tuple[Float, Float]:
+        change, covariance = usual(fit, slopes)
+        return 8 * change, covariance
+
+    def noted(fit: TotalFit) -> float:
+        misfits.append(usual_misfit(fit))
+        return misfits[-1]
+
+    def show(wires: WireOhm, most_cells: int) -> Shown:
+        cells.append(most_cells)
+        return skin.show(wires, most_cells)
+
+    monkeypatch.setattr(TotalFit, "wires", overdone)
+    monkeypatch.setattr(TotalFit, "misfit", noted)
+    WireSearch(NO_WIRES, show).found()
+    more = cells.index(TRIAL_CELLS)
+    assert max(misfits[:more]) > min(misfits[:more]) + 0.3  # a step went too far
+    assert misfits[more] < min(misfits[:more]) + LIKELY / PRESSES
 
 
 def test_wires_that_were_told_are_evidence() -> None:

@@ -119,9 +119,11 @@ class WireSearch:
         is_told = [ohm is not None for ohm in self._told[:2]]
         start = np.where(is_told, self._centre, np.minimum(self._centre, np.log(START_OHM)))
         best = self._nearest(self._trial(start, None), SHORT_STEP, CLOSE_STDS[0])
-        # L of more scans is not to be compared with that before, nor L of another filter.
+        # L of more scans is not to be compared with that before, nor L of another filter. So a step
+        # that is not short is not taken: it may be one that was too far.
         self._most_cells = TRIAL_CELLS
-        best = self._trial(best.held + best.step, best)
+        step = best.step * best.is_close(SHORT_STEP, CLOSE_STDS[0])
+        best = self._trial(best.held + step, best)
         self._scale = best.fit.scale_
         best = self._nearest(best, LAST_STEP, CLOSE_STDS[1])
         u, stds = likely_wires(best.held, best.change, best.covariance, self._centre, self._std)
@@ -146,7 +148,7 @@ class WireSearch:
         return _Trial(u, shown.wires, fit, fit.misfit(), *by_wires)
 
     def _nearest(self, best: _Trial, short: float, stds: float) -> _Trial:
-        """The best trial of all steps until they are short."""
+        """The last trial that is kept, of steps until they are short."""
         left = TRIALS
         while left and not best.is_close(short, stds):
             before = best
