@@ -128,6 +128,8 @@ class LiveCoverage:
     def look(self, scan: Scan, tare: Tare | None, sample: ForceSample | None) -> bool:
         """Take in a scan. Returns whether it has told something of the cells.
 
+        A scan that the estimator doubts tells nothing, as it teaches nothing later (`kneading`).
+
         tare: of the recording; None: it is not taken yet.
         sample: the newest force; None: there is none.
         """
