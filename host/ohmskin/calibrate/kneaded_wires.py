@@ -35,7 +35,7 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.calibrate.scale import Scale
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
-from ohmskin.calibrate.wires import FoundWires, wire_prior
+from ohmskin.calibrate.wires import FoundWires, unclear_layers, wire_prior
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.prior import USUAL_LEAD_STD_OHM
 
@@ -104,13 +104,16 @@ class _Trial(NamedTuple):
 class WireSearch:
     """Looks for the wires.
 
-    told: what was told of them.
+    told: what was told of them. shape: (R, C).
     show: what an estimator shows while the given wires are held, in scans that have about so many
         cells together at most.
     """
 
-    def __init__(self, told: WireOhm, show: Callable[[WireOhm, int], Shown]) -> None:
-        self._told, self._show, self._most_cells = told, show, FIRST_CELLS
+    def __init__(
+        self, told: WireOhm, shape: tuple[int, int], show: Callable[[WireOhm, int], Shown]
+    ) -> None:
+        self._told, self._shape = told, shape
+        self._show, self._most_cells = show, FIRST_CELLS
         self._scale: Scale | None = None
         self._centre, self._std = (of_wires[:2] for of_wires in wire_prior(told))
 
@@ -133,7 +136,8 @@ class WireSearch:
         (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(u).tolist(), stds.tolist()
         lead = best.wires.lead, best.wires.lead_std_ohm
         wires = WireOhm(top_ohm, bottom_ohm, lead[0], top_std, bottom_std, lead[1])
-        return FoundWires(wires, self._told, best.fit.presses, ())
+        unclear = unclear_layers(u, stds, self._shape)
+        return FoundWires(wires, self._told, best.fit.presses, unclear)
 
     def _trial(self, u: Float, last: _Trial | None) -> _Trial:
         """A trial. last: the one whose lead is taken, if any."""

@@ -132,7 +132,7 @@ class Kneading:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
         wires = calibrator.knowledge.nominal_wire_ohm
         if not calibrator.shows_wires:
-            search = WireSearch(wires, partial(self._shown, log))
+            search = WireSearch(wires, self.shape, partial(self._shown, log))
             calibrator.take_wires(search.found())
             # The curves are of the wires that were found, and not of what scans would teach.
             wires = held(calibrator.knowledge.nominal_wire_ohm)

@@ -152,8 +152,7 @@ class FoundWires:
     told: what was told before.
     presses: how many presses there were.
     unclear: layers whose wires are not clear: the deviation of their log is above `UNCLEAR_LOG`,
-        and the longest line is uncertain by more ohms than the hardest touch has. Those of a
-        kneaded skin are not judged.
+        and the longest line is uncertain by more ohms than the hardest touch has.
     """
 
     wires: WireOhm
@@ -220,15 +219,21 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
         tried += [(cost + found[0], *found[1:]) for found in map(fit.minimised, STARTS_OHM)]
     p, covariance = min(tried, key=lambda found: found[0])[1:]
     std = np.sqrt(covariance.diagonal())
-    lines = np.exp(p[:2]) * std[:2] * (knowledge.columns, knowledge.rows)
-    unclear = (std[:2] > UNCLEAR_LOG) & (lines > 1 / HIGHEST_TOUCH_SIEMENS)
-    layers = tuple(np.array(["top", "bottom"])[unclear].tolist())
     top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
     lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
     top_std, bottom_std = std[:2].tolist()
     wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std_ohm)
     presses = np.unique(readings.press).size
-    return FoundWires(wires, told, presses, layers)
+    unclear = unclear_layers(p[:2], std[:2], (knowledge.rows, knowledge.columns))
+    return FoundWires(wires, told, presses, unclear)
+
+
+def unclear_layers(logs: Float, stds: Float, shape: tuple[int, int]) -> tuple[str, ...]:
+    """Layers whose wires are not clear (`FoundWires`), by logs of their segments and deviations."""
+    rows, columns = shape
+    lines_ohm = np.exp(logs) * stds * (columns, rows)
+    unclear = (stds > UNCLEAR_LOG) & (lines_ohm > 1 / HIGHEST_TOUCH_SIEMENS)
+    return tuple(np.array(["top", "bottom"])[unclear].tolist())
 
 
 def _rows(readings: PressReadings, rest_current: Float) -> _Rows:
