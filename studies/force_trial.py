@@ -156,7 +156,7 @@ class Choreography:
         seen = np.searchsorted(steps_s, time_s)
         seed = int(self.random.integers(1 << 32))
         read: dict[str, tuple[Float, Float]] = {}
-        for mode in MODES:
+        for mode in ("near", "far"):
             board = OneFrameBoard(self.shape, seed, mode)
             rest_ratio = board.rest_ratio(self._skin)
             ratio = [
