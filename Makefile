@@ -151,7 +151,7 @@ far: setup ## lines sensed at both ends, near ends, zero potential, simulated: d
 	$(STUDY) far
 
 experiments: setup ## the paper's experiments with force, simulated: docs/force-*.png
-	for each in flat curved timeseries minimum; do $(STUDY) experiment $$each || exit 1; done
+	for each in flat curved kneaded timeseries minimum; do $(STUDY) experiment $$each || exit 1; done
 
 BENCH := $(ONE_THREAD) PYTHONPATH=.:tests/helpers $(BIN)/python benchmarks
 

@@ -19,7 +19,7 @@ from rich.progress import Progress
 from ohmskin.files import whole_file
 from studies import ablate as constants_tried
 from studies import chart as speed_accuracy
-from studies import chart_figure, force_experiment, force_figure, force_limits
+from studies import chart_figure, force_experiment, force_figure, force_kneading, force_limits
 from studies import far as far_ends
 from studies import stability as verdicts
 from studies.ablate_scenes import Plan
@@ -199,6 +199,21 @@ def curved(out: Out = DOCS, quick: QuickExperiment = False, only_json: Json = Fa
     About two minutes. The last line printed is one JSON object.
     """
     _surface(_run(out, only_json), "curved", quick)
+
+
+@experiment.command()
+def kneaded(out: Out = DOCS, quick: QuickExperiment = False, only_json: Json = False) -> None:
+    """The same skins kneaded over a scale, beside single touches: a PNG. About three minutes.
+
+    The last line printed is one JSON object.
+    """
+    run = _run(out, only_json)
+    with run.progress("steps") as show:
+        plan = force_kneading.QUICK if quick else force_kneading.FULL
+        rows = force_kneading.measure(*plan, show)
+    run.write("force-kneaded", picture=force_figure.kneading_picture(rows))
+    run.messages.print(force_kneading.kneading_table(rows))
+    run.answer(_asked(quick), rows=[row.figures() for row in rows])
 
 
 @experiment.command()

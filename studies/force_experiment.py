@@ -140,7 +140,7 @@ def measure(
     with threadpool_limits(limits=1):
         for comparison in comparisons:
             for cells in comparison.cells:
-                errors: dict[tuple[str, str], list[Float]] = {}
+                by_skin: dict[tuple[str, str], list[Float]] = {}
                 frames = 0
                 for seed in range(comparison.plan.seeds):
                     trial = surface_trial(
@@ -155,10 +155,11 @@ def measure(
                     for method in comparison.methods:
                         rise = rises(method, trial)
                         for regression in REGRESSIONS:
-                            of_method = errors.setdefault((regression, method), [])
-                            of_method.append(_errors(trial, rise, regression))
+                            of_method = by_skin.setdefault((regression, method), [])
+                            force_n = learn(trial, rise, regression)(rise)
+                            of_method.append(errors(trial, force_n))
                         steps.done()
-                means = {key: np.mean(skins, axis=0) for key, skins in errors.items()}
+                means = {key: np.mean(skins, axis=0) for key, skins in by_skin.items()}
                 rows += _rows("curved" if curved else "flat", comparison, cells, frames, means)
     return rows
 
@@ -211,11 +212,14 @@ def learn(trial: ForceTrial, rise: Float, regression: str) -> Callable[[Float], 
     return lambda seen: np.array([learned.model_.predict(frame, nothing)[0] for frame in seen])
 
 
-def _errors(trial: ForceTrial, rise: Float, regression: str) -> Float:
-    """Errors (groups, 3) [N]: `Row`'s calibration_n, pressed_n, every_cell_n."""
-    shape = rise.shape[1:]
-    off_n = (learn(trial, rise, regression)(rise) - trial.force_n).reshape(len(rise), -1)
-    of_robot_n = off_n[np.arange(len(rise)), trial.cell]
+def errors(trial: ForceTrial, force_n: Float) -> Float:
+    """Errors (groups, 3) [N]: `Row`'s calibration_n, pressed_n, every_cell_n.
+
+    force_n: what a method makes of the frames, (F, R, C).
+    """
+    shape = force_n.shape[1:]
+    off_n = (force_n - trial.force_n).reshape(len(force_n), -1)
+    of_robot_n = off_n[np.arange(len(force_n)), trial.cell]
     single = trial.group < 0
     names = groups_of(*shape)
     own = len(names) == len(off_n.T)

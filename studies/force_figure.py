@@ -17,8 +17,10 @@ from ohmskin.estimate.methods import METHODS, VOLTAGE
 from ohmskin.estimate.ohm import voltage_level
 from studies.drawing import INK, method_style, new_figure, png_of, prepare
 from studies.force_experiment import CHOICE, FAR, SLOW, TRUTH, UNTOLD, Row, learn, rises
+from studies.force_kneading import METHOD, SINGLE_VOLTAGE, SURFACES
+from studies.force_kneading import Row as KneadedRow
 from studies.force_limits import PRESSED_CELL
-from studies.force_trial import ForceTrial, groups_of
+from studies.force_trial import FORCES_N, ForceTrial, groups_of
 from studies.published import FORCE_RMSE_N
 
 _CELL_COLOURS: Final = ("#0072b2", "#000000", "#d55e00", "#8a8a8a")  # as in the paper's figure
@@ -135,6 +137,32 @@ def series_picture(trial: ForceTrial) -> bytes:
         prepare(axes, axis="y")
         axes.legend(loc="upper left", frameon=False, fontsize=9.5)
         axes.set_xlim(0, time_s[-1])
+    return png_of(figure)
+
+
+def kneading_picture(rows: Sequence[KneadedRow]) -> bytes:
+    """The rows of `force_kneading.measure` as a PNG: estimated over true force of touched cells."""
+    first, most_n = rows[0], FORCES_N[1]
+    figure = new_figure(12, 8.4)
+    skins = f"{first.rows}x{first.columns}, {first.skins} skins, {first.frames} frames each"
+    figure.suptitle(
+        f"Touched cells under 3 to 6 touches, by way of calibrating: simulated, {skins}",
+        fontsize=14,
+        color=INK,
+    )
+    grid = figure.subplots(len(SURFACES), len(rows) // len(SURFACES), sharex=True, sharey=True)
+    for axes, row in zip(grid.flat, rows, strict=True):
+        colour = _fill(VOLTAGE if row.calibrated == SINGLE_VOLTAGE else METHOD)["color"]
+        axes.plot(row.true_n, row.force_n, ".", color=colour, markersize=5, alpha=0.5)
+        axes.plot([0, most_n], [0, most_n], color=INK, linewidth=1)
+        axes.set_title(f"{row.surface}: {row.calibrated}", fontsize=12, color=INK)
+        words = f"RMSE: robot's cell {row.pressed_n:.2f} N\nevery cell {row.every_cell_n:.3f} N"
+        axes.text(0.04, 0.96, words, transform=axes.transAxes, va="top", fontsize=11, color=INK)
+        axes.set_xlim(0, most_n)
+        axes.set_ylim(bottom=0)
+        prepare(axes)
+    figure.supxlabel("true force [N]", color=INK)
+    figure.supylabel("estimated force [N]", color=INK)
     return png_of(figure)
 
 

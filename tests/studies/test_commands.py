@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from command_line import Run
-from studies import ablate, chart, commands, far, force_experiment, stability
+from studies import ablate, chart, commands, far, force_experiment, force_kneading, stability
 from studies.conditions import SWEEPS
 from studies.force_experiment import Comparison
 from studies.force_limits import Detection
@@ -25,6 +25,7 @@ SURFACES = (
     Comparison(3, 3, replace(SMALL, test_presses=1), FEW, ("whole",)),
 )
 METHODS = ("ohm", "matrix", "joint")
+KNEADED = (3, replace(SMALL, test_presses=1), 20.0)
 DETECTION = Detection(seeds=1, empty_frames=40, frames=8, forces=4, methods=("voltage", "joint"))
 CHART = chart.Plan(1, 8, warm_up=2, repeats=1, sizes=(chart.Size(2, 2, 3),), methods=METHODS)
 STABILITY = stability.Plan(1, 1, paper_skins=0, paper_shape=(2, 2), shape=(2, 2))
@@ -40,6 +41,7 @@ def study(monkeypatch: pytest.MonkeyPatch, run: Run) -> Run:
     monkeypatch.setattr(far, "WIRE_OHM", (100.0, 1000.0))
     monkeypatch.setattr(ablate, "measure", partial(ablate.measure, scenes=["ngspice_random"]))
     monkeypatch.setattr(force_experiment, "QUICK", SURFACES)
+    monkeypatch.setattr(force_kneading, "QUICK", KNEADED)
     monkeypatch.setattr(commands, "QUICK_DETECTION", DETECTION)
     return partial(run, program="studies")
 
@@ -95,7 +97,12 @@ def test_ablate(answered: Any, study: Run) -> None:
 
 @pytest.mark.parametrize(
     ("name", "key"),
-    [("curved", "rows"), ("timeseries", "cross_talk"), ("minimum", "smallest_forces")],
+    [
+        ("curved", "rows"),
+        ("kneaded", "rows"),
+        ("timeseries", "cross_talk"),
+        ("minimum", "smallest_forces"),
+    ],
 )
 def test_experiments(answered: Any, name: str, key: str) -> None:
     answer, _, err = answered(f"experiment {name} --quick --json")
