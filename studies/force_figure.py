@@ -143,6 +143,7 @@ def series_picture(trial: ForceTrial) -> bytes:
 def kneading_picture(rows: Sequence[KneadedRow]) -> bytes:
     """The rows of `force_kneading.measure` as a PNG: estimated over true force of touched cells."""
     first, most_n = rows[0], FORCES_N[1]
+    top_n = max(most_n, *(float(row.force_n.max()) for row in rows))
     figure = new_figure(12, 8.4)
     skins = f"{first.rows}x{first.columns}, {first.skins} skins, {first.frames} frames each"
     figure.suptitle(
@@ -159,7 +160,7 @@ def kneading_picture(rows: Sequence[KneadedRow]) -> bytes:
         words = f"RMSE: robot's cell {row.pressed_n:.2f} N\nevery cell {row.every_cell_n:.3f} N"
         axes.text(0.04, 0.96, words, transform=axes.transAxes, va="top", fontsize=11, color=INK)
         axes.set_xlim(0, most_n)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.05 * top_n)
         prepare(axes)
     figure.supxlabel("true force [N]", color=INK)
     figure.supylabel("estimated force [N]", color=INK)
