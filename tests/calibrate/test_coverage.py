@@ -60,6 +60,14 @@ def test_a_number_that_comes_at_once_or_is_small_is_no_news() -> None:
     assert coverage.is_news(3.0, 1.0)  # another recording, by another clock
 
 
+def test_every_number_of_a_scale_that_prints_ten_a_second_is_news() -> None:
+    """Three of ten came after a little less than 0.1 s, and were lost."""
+    random, coverage = np.random.default_rng(1), Coverage(2)
+    for at_s in 0.1 * np.arange(300) + 0.004 * random.standard_normal(300):
+        assert coverage.is_news(at_s, 1.0)
+        coverage.add(at_s, np.array([1e-5, 0.0]), 1.0)
+
+
 def record_kneading(path: Path, seconds: float, seed: int) -> Recording:
     """A skin of 2x3 that is kneaded over a sensor whose zero is at 3 N."""
     url = f"emulator://2x3?scene=knead&begin=1.5&speed=0&seed={seed}&rate=40"

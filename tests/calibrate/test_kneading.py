@@ -297,6 +297,28 @@ def learned(run: Run, recording: Path, out: Path, *options: str) -> dict[str, An
     return said
 
 
+def test_every_number_of_a_slow_scale_counts(
+    skin: KneadedSkin, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a press, every second to fourth scan is used, and numbers beside the others were lost."""
+    recording, given = tmp_path / "knead.mcap", []
+    skin.record_kneading(recording, ScaleBelow(10.0, 0.1, 0.1))
+    usual = TotalFit.__init__
+
+    def noted(fit: TotalFit, totals: Totals, *more: Any, **options: Any) -> None:
+        given.append(totals)
+        usual(fit, totals, *more, **options)
+
+    monkeypatch.setattr(TotalFit, "__init__", noted)
+    learned(run, recording, tmp_path / "skin.json")
+    scans, forces = load_recording(recording).scans, load_recording(recording).forces
+    ends_s = scans[0].host_time_s, scans[-1].host_time_s
+    shown = sum(ends_s[0] <= force.host_time_s <= ends_s[1] for force in forces)
+    last = given[-1]
+    assert last.time_s.size < 0.8 * len(scans)
+    assert last.shown_s.size > 0.97 * shown
+
+
 @pytest.mark.parametrize("pole_s", [0.1, 0.8])
 def test_a_log_of_the_scale_may_be_late_and_untared(
     skin: KneadedSkin, run: Run, tmp_path: Path, pole_s: float

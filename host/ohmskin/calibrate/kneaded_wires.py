@@ -15,9 +15,9 @@ L              -log of how likely the total forces are (`TotalFit.misfit`), for 
 ====== ======= ========================================================================= =======
 
 In a trial, the wires are held at some u, an estimator shows the scans, and a `TotalFit` has L. It
-also tells w (`TotalFit.wires`). Presses tell ohms, so the next trial is at u + log(1 + w), or at
-u + w where segments become smaller: then 1 + w may be below 0. If its L is larger by more than
-`LIKELY` for all presses together, that was too far, and half of the way is tried.
+also tells w (`TotalFit.wires`). Presses tell ohms, so the next trial is at u + log(1 + w). Where w
+is below 0, it is at u + w, because 1 + w may be below 0. If L of all presses together is then
+larger by more than `LIKELY`, that was too far, and half of the way is tried.
 
 Few presses tell little of the wires, so what is taken at last is no maximum but the mean of all
 wires that they do not exclude (`likely_wires`). Behind wires that are too large, the cells under

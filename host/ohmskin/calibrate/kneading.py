@@ -145,14 +145,21 @@ class Kneading:
         number = self._recording[np.searchsorted(self.time_s, time_s)]
         return int(number), float(self.time_s[np.searchsorted(self._recording, number)])
 
+    @property
+    def _every(self) -> int:
+        """How many scans of a press there are for one that is used."""
+        step_s = float(np.median(np.diff(self.time_s)))
+        pressed = int(np.count_nonzero(self._press >= 0))
+        return max(round(SCAN_STEP_S / step_s), pressed // MOST_SCANS + 1)
+
     def _spaced(self) -> Bool:
         """Which scans to use, (n,): pauses, ends of presses, and at most `MOST_SCANS` others."""
         counts = np.cumsum(self._press >= 0)
-        step_s = float(np.median(np.diff(self.time_s)))
-        every = max(round(SCAN_STEP_S / step_s), int(counts[-1] // MOST_SCANS) + 1, 1)
         is_edge = np.diff(self._press, append=-1) != 0
         is_edge[1:] |= is_edge[:-1]
-        return np.asarray(self._is_clear & ((self._press < 0) | is_edge | (counts % every == 0)))
+        return np.asarray(
+            self._is_clear & ((self._press < 0) | is_edge | (counts % self._every == 0))
+        )
 
     def _in_stretches(self, log: ForceLog, most_cells: int) -> Bool:
         """Which scans to use, (n,): those of `_spaced` in some stretches of presses of known force.
@@ -212,8 +219,8 @@ class Kneading:
     def _totals(self, levels: _Levels, log: ForceLog) -> Totals:
         """What skin and scale have shown.
 
-        Numbers of the scale beside unused scans, and those of gaps of the scans, are left out. If
-        the scale has shown more numbers than there are scans, forces are taken at the scans.
+        Numbers of the scale amid unused scans, and those of gaps of the scans, are left out. If the
+        scale has shown more numbers than scans are used, forces are taken at these scans.
         """
         time_s, used = self.time_s, levels.used
         rise = levels.rise[used]
@@ -222,14 +229,25 @@ class Kneading:
             return Totals(self.shape, *of_scans, time_s[used], log.at(time_s[used]), lags=False)
         inside = (log.time_s >= time_s[0]) & (log.time_s <= time_s[-1])
         at_s = log.time_s[inside]
-        if at_s.size > time_s.size:
-            at_s = time_s
+        if at_s.size > np.count_nonzero(used):
+            at_s = time_s[used]
         shown_n = log.at(at_s)
-        scan = np.searchsorted(time_s, at_s).clip(0, time_s.size - 1)
-        known = np.isfinite(shown_n) & used[scan] & ~self._unseen(at_s)
+        known = np.isfinite(shown_n) & self._amid(used, at_s) & ~self._unseen(at_s)
         if not known.any():
             raise ValueError("skin and scale were not read at the same time")
         return Totals(self.shape, *of_scans, at_s[known], shown_n[known])
+
+    def _amid(self, used: Bool, at_s: Float) -> Bool:
+        """Whether a time, (m,) [s], is between used scans of its press or pause, without others.
+
+        Those that are skipped because they are near (`SCAN_STEP_S`) are no others.
+        """
+        scan = np.searchsorted(self.time_s, at_s).clip(0, self.time_s.size - 1)
+        numbers = np.flatnonzero(used)
+        after = numbers[np.searchsorted(numbers, scan).clip(max=numbers.size - 1)]
+        before = numbers[(np.searchsorted(numbers, scan, "right") - 1).clip(0)]
+        alike = (self._press[[before, after]] == self._press[scan]).all(axis=0)
+        return np.asarray(alike & (np.abs(after - before) <= self._every))
 
     def _unseen(self, at_s: Float) -> Bool:
         """Whether what the scale shows then, (m,) [s], may be of a gap of the scans."""

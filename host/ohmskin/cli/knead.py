@@ -33,9 +33,7 @@ from ohmskin.view.kneaded import KneadedBoard
 # Where no terminal shows the map, a line says how much is known, once in this time [s]. Chosen:
 # some lines a minute.
 _SAY_EVERY_S: Final = 10.0
-
-
-TOUCH_NOTHING: Final = "touch nothing yet"
+_TOUCH_NOTHING: Final = "touch nothing yet"
 
 
 class KneadMap:
@@ -64,9 +62,8 @@ class KneadMap:
             raise TareRefused(f"the force moved by {moved_n:.1f} N at rest", remedy)
         self.has_rest = self._recorder.tare is not None
         if self._page is not None:
-            coverage, words = self._coverage, self.words() if self.has_rest else TOUCH_NOTHING
-            known = coverage.log_std, coverage.known, coverage.next_cell
-            self._page.show(scan, *known, words)
+            known = self._coverage.log_std, self._coverage.known, self._coverage.next_cell
+            self._page.show(scan, *known, self.words() if self.has_rest else _TOUCH_NOTHING)
         if not TERMINAL.is_terminal and scan.host_time_s - self._said_s >= _SAY_EVERY_S:
             self._said_s = scan.host_time_s
             TERMINAL.print(f"{scan.host_time_s - self._began_s:.0f} s: {self.words()}")
@@ -86,7 +83,7 @@ class KneadMap:
         """All of it."""
         force, tare = self._recorder.force, self._recorder.tare
         shown = "" if force is None else f"   force {force.force_n:.2f} N"
-        doing = TOUCH_NOTHING if tare is None else self.words()
+        doing = _TOUCH_NOTHING if tare is None else self.words()
         percent, known = 100 * self._coverage.log_std, self._coverage.known
         cells = [[Text(f"{each:.0f}") for each in row] for row in percent.tolist()]
         for at in np.ndindex(known.shape):

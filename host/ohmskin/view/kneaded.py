@@ -27,7 +27,7 @@ class KneadedBoard:
         self.shown: Shown | None = None
         self.watchers: set[Callable[[], None]] = set()
         self.closing = threading.Event()
-        self._words, self._status, self._said_s = "touch nothing yet", "scanning", -np.inf
+        self._words, self._status, self._said_s = "", "scanning", -np.inf
 
     def state(self) -> dict[str, Any]:
         """What the page shows besides the map, as values for JSON."""
