@@ -31,19 +31,19 @@ def test_the_page_is_sent_what_is_known_and_can_command_nothing() -> None:
     log_std = np.array([[0.12, 0.5, 0.1], [0.14, 0.9, 0.2]])
 
     def show(scan: Scan, words: str) -> None:
-        kneaded.show(scan, log_std, log_std <= 0.15, (1, 1), words)
+        kneaded.show(scan, log_std, log_std <= 0.15, (0, 2), words)
 
     with TestClient(make_app(boards, "127.0.0.1", TOKEN), base_url=ORIGIN) as client:
         client.params = {"token": TOKEN}
         with panel(client) as page:
             state = page.until_state(lambda state: state["kneaded"])
             assert (state["port"], state["board"]["rows"], state["methods"]) == ("a port", 2, [])
-            show(scan, "press at row 1, column 1")
+            show(scan, "press at row 0, column 2")
             seen = page.scan(lambda scan: True)
             np.testing.assert_allclose(seen["log_std"], log_std, rtol=1e-6)
             assert seen["touched"].tolist() == [[1, 0, 1], [1, 0, 0]]
-            assert seen["contacts"] == [["next", 1, 1, None, None]]
-            page.until_state(lambda state: state["note"] == "press at row 1, column 1")
+            assert seen["contacts"] == [["next", 0, 2, None, None]]
+            page.until_state(lambda state: state["note"] == "press at row 0, column 2")
             show(later, "a tenth of a second later")  # too soon for a reader
             for command in ({"do": "tare", "force": True}, {"do": "record"}, {"do": "undo"}):
                 page.refused("does not know", **command)
