@@ -4,11 +4,13 @@
 import numpy as np
 import pytest
 
+from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
 from ohmskin.estimate.joint import TELLING_SHARE
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
     PALM_SHARE,
+    UNTOUCHED_STD,
     CellPrior,
     WireStds,
     rest_level,
@@ -99,3 +101,41 @@ def test_fingertips_are_no_palm() -> None:
     of_palm = prior.spread_share(-np.log(1e-6 + 1e-4 * middle).ravel())
     assert of_palm == pytest.approx(middle.mean(), rel=0.01)
     assert of_palm > PALM_SHARE
+
+
+def touched(*rows: str) -> tuple[CellPrior, Float, tuple[int, int]]:
+    """A prior, logs of cells that conduct twice as much where a row has an "x", and the shape."""
+    on = np.array([[mark == "x" for mark in row] for row in rows])
+    rest = np.full(on.size, np.log(1e6))
+    prior = CellPrior(rest, np.full(on.size, 0.05), np.zeros((on.size, 3)), np.zeros(3))
+    return prior, rest - np.log(2) * on.ravel(), on.shape
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        (
+            ("........", "..xx....", "..xx....", "........", "........", "........"),
+            (".xxxx...", ".xxxx...", ".xxxx...", ".xxxx...", "........", "........"),
+        ),
+        (  # at the edge of the skin, beside a touch by itself
+            ("xx......", "xx......", "x.......", "........", "......x.", "........"),
+            ("xxx.....", "xxx.....", "xxx.....", "xx......", "........", "........"),
+        ),
+        (  # as many neighbours as by chance
+            (".xx.....", "........", "x...x.x.", "........", "..x..x..", "..x....."),
+            ("........",) * 6,
+        ),
+        (("xx......", "........", "........"), ("........",) * 3),
+        (("xx.", "xx.", "..."), ("...",) * 3),
+        (("xxx.....",), ("........",)),
+    ],
+)
+def test_cells_within_reach_of_fingertips(rows: tuple[str, ...], expected: tuple[str, ...]) -> None:
+    """Cells around touched neighbours, if these are more than by chance."""
+    prior, log_ohm, shape = touched(*rows)
+    near = prior.fingertips(log_ohm, shape).reshape(shape)
+    assert ["".join("x" if cell else "." for cell in row) for row in near] == list(expected)
+    wide = prior.for_fingertips(log_ohm, shape).std.reshape(shape)
+    assert (wide[near] == UNTOUCHED_STD).all()
+    assert (wide[~near] == 0.05).all()

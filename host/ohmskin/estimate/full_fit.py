@@ -377,22 +377,6 @@ class FullFit:
         # No cell gets a narrower deviation than it had.
         return unnoticed & (unnoticed_std > self._cell_std), unnoticed_std
 
-    @property
-    def moves_wires(self) -> float:
-        """By how many deviations the means of the wires have moved: |u| of these."""
-        return float(np.linalg.norm(self._mean_stds))
-
-    @property
-    def cost(self) -> float:
-        """What was minimised, at its minimum: the lower one of two fits is the more probable.
-
-        It is without log det N. So only fits of one frame, with one prior and belief, compare.
-        """
-        away = np.square((self.log_cells - self._prior.expected) / self._prior.std)
-        by_cells = np.where(away < 1.0, away, 1.0 + np.log(np.maximum(away, 1.0)))
-        by_readings = self.misfit * self._current.size + self._wires_square
-        return float(by_readings + self.moves_wires**2 + by_cells.sum())
-
     def cells_by_means(self) -> Float:
         """How fitted cells follow the means, for the same readings, (RC, n): d log r / d mean."""
         return self._cells_by(self._by_mean, self._by_cell)

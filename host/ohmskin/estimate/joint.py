@@ -11,8 +11,7 @@ deviations of the answer say how much of it comes from the prior:
 
 The maximum of the posterior is found by a few Gauss-Newton steps (`full_fit`). They begin at the
 few touches that `sparse_fit` finds. If touches are many, as under a fingertip, they begin at the
-cells that `matrix` finds. Where the first beginning ends at wires that nobody expects, the second
-one is tried, too, and the more probable end is the answer.
+cells that `matrix` finds.
 
 `touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
 few touches. Where they do not explain the frame, its answer is that of `joint`. Without rest
@@ -61,11 +60,6 @@ from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, WireBelief
 REST_FITS: Final = 3
 # A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
-
-# A fit that starts at few touches, and moves the means of the wires by more deviations, is compared
-# with one that starts at the cells that `matrix` finds. Chosen: wires that are as expected seldom
-# move by as much, so that few frames take the time of two fits.
-MOVED_STDS: Final = 1.0
 
 # Fits expect leaks if these explain so much of how cells differ at rest: it is the gain in twice
 # the log likelihood. Chosen: few sound skins gain as much by chance, and it costs them some time
@@ -236,16 +230,12 @@ class JointEstimator(Estimator):
             ), again
         start = self._start(prior, ports, touches)
         self._belief.before_fit(start, ports)
-        fit_prior = prior.for_soft_touches() if prior.is_soft(start, self._shape) else prior
+        if prior.is_soft(start, self._shape):
+            fit_prior = prior.for_soft_touches()
+        else:
+            fit_prior = prior.for_fingertips(start, self._shape)
         self._belief.expect_usual_leads(prior.is_crowded(start))
         fit = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
-        if touches is not None and fit.moves_wires > MOVED_STDS:
-            # Few touches leave weak cells at rest, and wires may take the place of these: a lead
-            # that nothing else shows, and hard cells that come out larger by half.
-            start = self._start(prior, ports, None)
-            other = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
-            if not other.message and (fit.message or other.cost < fit.cost):
-                fit = other
         spread_share = prior.spread_share(fit.log_cells)
         if spread_share > PALM_SHARE and fit_prior is not prior:
             # So many cells are not the few hard touches that the narrow prior would prefer. It
@@ -579,6 +569,10 @@ class TouchEstimator(JointEstimator):
         """
         # Where wires are assumed, the fit of all resistances teaches them sooner.
         if self.knowledge.rest_ratio is None or self._belief.is_assumed:
+            return None
+        # Cells at the edge of a fingertip seem untouched here, which would pass for a lead.
+        assert self._prior is not None
+        if self._prior.fingertips(touches.log_cells, self._shape).any():
             return None
         touched = touches.explain()
         if touched and touched.log_cells_std[touched.cells].max(initial=0.0) <= CLEAR_LOG:
