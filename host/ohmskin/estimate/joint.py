@@ -88,6 +88,9 @@ TELLING_SHARE: Final = 0.4
 # Skins of fewer ports are told no such fault. Chosen: on 3x3, a few odd readings spoil a whole
 # frame.
 LEAST_STAYING_PORTS: Final = 16
+# A mean lead is known if its deviation is no larger [ohm]. Then weak cells at the edge of a
+# fingertip cannot pass for it. Chosen: such a lead moves hard cells by a few percent.
+KNOWN_LEAD_STD_OHM: Final = 50.0
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
 # by less than their rounding.
 LEAD_MOVE_OHM: Final = 20.0
@@ -230,9 +233,10 @@ class JointEstimator(Estimator):
             ), again
         start = self._start(prior, ports, touches)
         self._belief.before_fit(start, ports)
+        fit_prior = prior
         if prior.is_soft(start, self._shape):
             fit_prior = prior.for_soft_touches()
-        else:
+        elif self._may_lead_mislead:
             fit_prior = prior.for_fingertips(start, self._shape)
         self._belief.expect_usual_leads(prior.is_crowded(start))
         fit = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
@@ -367,6 +371,12 @@ class JointEstimator(Estimator):
     def _hides_rest(self) -> bool:
         """Whether wires resist so much that they hide even the cells at rest."""
         return self._rest_wires_log_std > REST_STD
+
+    @property
+    def _may_lead_mislead(self) -> bool:
+        """Whether weak cells at the edge of a fingertip may pass for a lead that nobody knows."""
+        is_read = not all(self._belief.far)
+        return is_read and float(self._belief.means_std()[2]) > KNOWN_LEAD_STD_OHM
 
     def _line_ohm(self) -> float:
         """Resistance of the wire of a row or of a column, whichever is more, end to end [ohm]."""
@@ -570,9 +580,10 @@ class TouchEstimator(JointEstimator):
         # Where wires are assumed, the fit of all resistances teaches them sooner.
         if self.knowledge.rest_ratio is None or self._belief.is_assumed:
             return None
-        # Cells at the edge of a fingertip seem untouched here, which would pass for a lead.
+        # Cells at the edge of a fingertip seem untouched here.
         assert self._prior is not None
-        if self._prior.fingertips(touches.log_cells, self._shape).any():
+        tips = self._prior.fingertips(touches.log_cells, self._shape)
+        if self._may_lead_mislead and tips.any():
             return None
         touched = touches.explain()
         if touched and touched.log_cells_std[touched.cells].max(initial=0.0) <= CLEAR_LOG:
