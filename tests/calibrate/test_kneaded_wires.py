@@ -9,7 +9,6 @@ from scipy.integrate import quad
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.kneaded_wires import (
-    LIKELY,
     TRIAL_CELLS,
     Shown,
     WireSearch,
@@ -68,11 +67,11 @@ class Skin:
 
     def show(self, wires: WireOhm, most_cells: int) -> Shown:
         assert most_cells >= 60_000
-        assert wires.both is not None
-        self.believed.append(wires.both)
-        rise = self.seen(*wires.both)
+        both = wires.top or 150.0, wires.bottom or 150.0  # such scans teach nothing of wires
+        self.believed.append(both)
+        rise = self.seen(*both)
         segments = np.array([TOP_SEGMENTS, BOTTOM_SEGMENTS])[:, None, :]
-        slopes = rise * segments * np.array(wires.both)[:, None, None]
+        slopes = rise * segments * np.array(both)[:, None, None]
         none = np.zeros_like(self._time_s)
         of_skin = self._time_s, rise, self._press, none
         return Shown(Totals(SHAPE, *of_skin, self._shown_s, self._shown_n), slopes, wires)
@@ -105,7 +104,7 @@ def test_a_step_that_is_too_long_is_halved(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(TotalFit, "wires", overdone)
     found = WireSearch(NO_WIRES, SHAPE, skin.show).found().wires
-    assert max(bottom for _, bottom in skin.believed) > 350  # a step went too far
+    assert max(bottom for _, bottom in skin.believed) > 300  # a step went too far
     assert found.top == pytest.approx(100, rel=0.4)
     assert found.bottom == pytest.approx(200, rel=0.4)
 
@@ -133,9 +132,9 @@ def test_a_step_that_was_too_long_is_not_taken_with_more_scans(
     monkeypatch.setattr(TotalFit, "wires", overdone)
     monkeypatch.setattr(TotalFit, "misfit", noted)
     WireSearch(NO_WIRES, SHAPE, show).found()
-    more = cells.index(TRIAL_CELLS)
+    more = cells.index(TRIAL_CELLS) - 1  # before the first trial, the scans alone are asked
     assert max(misfits[:more]) > min(misfits[:more]) + 0.3  # a step went too far
-    assert misfits[more] < min(misfits[:more]) + LIKELY / PRESSES
+    assert misfits[more] < min(misfits[:more]) + 0.1  # a short step at most
 
 
 def test_wires_that_presses_hardly_tell_are_unclear() -> None:
@@ -160,21 +159,24 @@ def test_a_layer_that_was_told_alone_is_held_as_told_at_first() -> None:
     """It began at 50 ohm, like one that nobody has told."""
     skin = Skin(1000.0, 200.0)
     WireSearch(WireOhm(top=1000.0, top_log_std=0.05), SHAPE, skin.show).found()
-    assert skin.believed[0] == pytest.approx((1000, 50))
+    assert skin.believed[1] == pytest.approx((1000, 50))
 
 
-def test_the_lead_is_that_of_the_wires_that_are_found() -> None:
-    """It was that of the trial before the mean of the wires."""
-    skin = Skin(100.0, 200.0, noise=0.3)
+def test_scans_teach_wires_and_lead_before_presses_do() -> None:
+    """An emulated skin had leads of 0 to 245 ohm, by which trial was the last; it has 80."""
+    skin, told = Skin(100.0, 200.0, noise=0.3), []
 
     def show(wires: WireOhm, most_cells: int) -> Shown:
         shown = skin.show(wires, most_cells)
-        return shown._replace(wires=wires._replace(lead=sum(skin.believed[-1])))
+        told.append(wires)
+        taught = WireOhm(120.0, 180.0, 70.0, 0.1, 0.1, 20.0)
+        return shown if len(told) > 1 else shown._replace(wires=taught)
 
     found = WireSearch(NO_WIRES, SHAPE, show).found().wires
-    assert found.both == pytest.approx(skin.believed[-1])  # the mean, which was tried
-    assert found.lead == pytest.approx(sum(skin.believed[-1]))
-    assert found.lead != pytest.approx(sum(skin.believed[-2]), rel=0.02)
+    assert skin.believed[1] == pytest.approx((120, 180))
+    assert {wires.lead for wires in told[1:]} == {70.0}
+    assert (found.lead, found.lead_std_ohm) == (70.0, 20.0)
+    assert found.both == pytest.approx((120, 180), rel=0.2)  # presses tell less than that
 
 
 @pytest.mark.parametrize(("ohm", "std_ohm"), [(100.0, 5.0), (500.0, 250.0), (200.0, 400.0)])

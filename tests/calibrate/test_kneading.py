@@ -405,9 +405,10 @@ def test_a_skin_that_was_kneaded_reads_forces(
 
     monkeypatch.setattr(kneading, "make_estimator", spied)
     said = learned(run, recording, out)
-    # The trials, and the reading after them: no scan moves the segments amid the others.
+    # The first reading is told nothing. In trials, and in the last one, no scan moves the wires.
     wires = np.array([knowledge.nominal_wire_ohm for knowledge in told], dtype=np.float64)
-    assert wires[:, 3:5].max() < 0.01
+    assert wires[1:, 3:6].max() < 0.01
+    assert np.ptp(wires[1:, 2]) == 0
     assert wires[-1, :2].tolist() == pytest.approx([said["top"], said["bottom"]])
     assert said["left_out"] == []
     assert abs(said["lag_s"]) < 0.03

@@ -23,8 +23,9 @@ Few presses tell little of the wires, so what is taken at last is no maximum but
 wires that they do not exclude (`likely_wires`). Behind wires that are too large, the cells under
 much force conduct without limit, which w says nothing of. So the mean, too, is tried.
 
-In the total force, a lead looks like a resistance in series with each contact. So leads are not
-found here: the estimator learns them from frames of several touches.
+The scans teach wires, too, without any force, because each touch has several cells. Where they do
+so surely (`SURE_LEAD`), the search begins with that, and it is the prior. In the total force, a
+lead looks like a resistance in series with each contact. So the lead is what the scans teach.
 """
 
 from collections.abc import Callable
@@ -37,7 +38,7 @@ from ohmskin.calibrate.scale import Scale
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.calibrate.wires import FoundWires, unclear_layers, wire_prior
 from ohmskin.estimate.knowledge import WireOhm
-from ohmskin.estimate.prior import USUAL_LEAD_STD_OHM
+from ohmskin.estimate.prior import LAYER_STD, USUAL_LEAD_STD_OHM
 
 # A trial takes as many scans as have about so many cells together: the first number in the first
 # trials, the second one after a short step. Chosen: 16x16 cells then take some minutes.
@@ -49,28 +50,31 @@ TRIALS, LONGEST_STEP, SHORT_STEP, LAST_STEP = 6, 1.5, 0.5, 0.1
 # Trials also end at a step below so many standard deviations of the wires, with the first number of
 # scans and with the second. Chosen: the presses do not tell the wires better.
 CLOSE_STDS: Final = (1.0, 0.7)
-# Segments that nobody has told are at most this in the first trial [ohm]. Chosen: from there, steps
-# lead to the wires that textiles have. With wires that are far too large, cells under much force
-# conduct without limit.
+# Segments of which neither somebody nor the scans have told are at most this in the first trial
+# [ohm]. Chosen: from there, steps lead to the wires that textiles have. With wires that are far too
+# large, cells under much force conduct without limit.
 START_OHM: Final = 50.0
-# L of all presses together may grow by so much with a step, or to the mean. Chosen: the same wires,
-# estimated again with another lead, differ by so much, and a mean is about so far from the most
-# likely wires.
+# Scans teach wires if they make the lead surer than by this factor, or know both layers to
+# `LAYER_STD`. Chosen: touches with sharp edges do the first, and large wires the second. Cells at a
+# soft edge look untouched and are not, which passes for wires.
+SURE_LEAD: Final = 0.5
+# L of all presses together may grow by so much with a step, or to the mean. Chosen: a mean is about
+# so far from the most likely wires.
 LIKELY: Final = 3.0
 # The mean of the wires is that of so many trial values of each layer, up to so many deviations from
 # the most likely one, which is this share of what was held at least. Chosen: fine enough for 1 %,
 # and as far as the prior reaches.
 GRID_POINTS, GRID_STDS, LEAST_SHARE = 121, 6.0, 0.2
-# Deviation of the logs of segments that are held, in trials and in the last reading. Chosen: so
-# small that no scan teaches others.
-HELD_LOG_STD: Final = 1e-3
+# Deviations of the logs of segments, and of the lead [ohm], that are held, in trials and in the
+# last reading. Chosen: so small that no scan teaches others.
+HELD_LOG_STD, HELD_LEAD_STD_OHM = 1e-3, 1e-3
 
 
 class Shown(NamedTuple):
-    """What an estimator shows of the scans while some wires are held.
+    """What an estimator shows of the scans that is told some wires.
 
     slopes: how its rises follow the wires, (2, n, C), as in `WireSlopes`.
-    wires: these wires, with the lead that the scans have taught.
+    wires: these wires, with what the scans have taught.
     """
 
     totals: Totals
@@ -79,10 +83,9 @@ class Shown(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """A trial: u, the wires after it, the fit, L, w and the covariance of w, (2, 2)."""
+    """A trial: u, the fit, L, w and the covariance of w, (2, 2)."""
 
     held: Float
-    wires: WireOhm
     fit: TotalFit
     misfit: float
     change: Float
@@ -105,7 +108,7 @@ class WireSearch:
     """Looks for the wires.
 
     told: what was told of them. shape: (R, C).
-    show: what an estimator shows while the given wires are held, in scans that have about so many
+    show: what an estimator shows that is told the given wires, in scans that have about so many
         cells together at most.
     """
 
@@ -115,41 +118,53 @@ class WireSearch:
         self._told, self._shape = told, shape
         self._show, self._most_cells = show, FIRST_CELLS
         self._scale: Scale | None = None
-        self._centre, self._std = (of_wires[:2] for of_wires in wire_prior(told))
+        self._least = np.inf  # L of the most likely trial with these scans
 
     def found(self) -> FoundWires:
         """The wires. Raises ValueError where the force does not follow the skin."""
-        is_told = [ohm is not None for ohm in self._told[:2]]
-        start = np.where(is_told, self._centre, np.minimum(self._centre, np.log(START_OHM)))
-        best = self._nearest(self._trial(start, None), SHORT_STEP, CLOSE_STDS[0])
-        # L of more scans is not to be compared with that before, nor L of another filter. So a step
-        # that is not short is not taken: it may be one that was too far.
-        self._most_cells = TRIAL_CELLS
+        start = self._taught()
+        best = self._nearest(self._trial(start), SHORT_STEP, CLOSE_STDS[0])
+        # L of more scans is not to be compared with that before, nor L of another filter, which is
+        # kept from the first trial near the wires on. So a step that is not short is not taken: it
+        # may be one that was too far.
+        self._most_cells, self._least = TRIAL_CELLS, np.inf
         step = best.step * best.is_close(SHORT_STEP, CLOSE_STDS[0])
-        best = self._trial(best.held + step, best)
-        self._scale = best.fit.scale_
-        best = self._nearest(best, LAST_STEP, CLOSE_STDS[1])
+        best = self._nearest(self._trial(best.held + step), LAST_STEP, CLOSE_STDS[1])
         u, stds = likely_wires(best.held, best.change, best.covariance, self._centre, self._std)
         if np.abs(u - best.held).max() > LAST_STEP:
             best, _ = self._tried(u, best, TRIALS)
             u = best.held
         (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(u).tolist(), stds.tolist()
-        lead = best.wires.lead, best.wires.lead_std_ohm
-        wires = WireOhm(top_ohm, bottom_ohm, lead[0], top_std, bottom_std, lead[1])
+        lead_ohm, lead_std_ohm = self._lead
+        wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std_ohm)
         unclear = unclear_layers(u, stds, self._shape)
         return FoundWires(wires, self._told, best.fit.presses, unclear)
 
-    def _trial(self, u: Float, last: _Trial | None) -> _Trial:
-        """A trial. last: the one whose lead is taken, if any."""
+    def _taught(self) -> Float:
+        """u of the first trial. Takes the lead, and the prior, that the scans alone teach."""
         lead_ohm, lead_std_ohm = self._told.lead_or_usual(USUAL_LEAD_STD_OHM)
-        lead = lead_ohm if last is None else last.wires.lead
+        told = self._told._replace(lead=lead_ohm, lead_std_ohm=lead_std_ohm)
+        taught = self._show(told, FIRST_CELLS).wires
+        self._lead = taught.lead_or_usual(USUAL_LEAD_STD_OHM)
+        stds = [LAYER_STD if std is None else std for std in taught[3:5]]
+        knows = self._lead[1] < SURE_LEAD * lead_std_ohm or max(stds) < LAYER_STD
+        self._centre, self._std = (p[:2] for p in wire_prior(taught if knows else self._told))
+        is_known = [knows or ohm is not None for ohm in self._told[:2]]
+        return np.where(is_known, self._centre, np.minimum(self._centre, np.log(START_OHM)))
+
+    def _trial(self, u: Float) -> _Trial:
+        """A trial."""
         top_ohm, bottom_ohm = np.exp(u).tolist()
-        wires = held(WireOhm(top_ohm, bottom_ohm, lead, lead_std_ohm=lead_std_ohm))
-        shown = self._show(wires, self._most_cells)
+        shown = self._show(held(WireOhm(top_ohm, bottom_ohm, self._lead[0])), self._most_cells)
         fit = TotalFit(shown.totals, self._scale, for_wires=True).fit()
         off = self._centre - u
         by_wires = fit.wires(WireSlopes(shown.slopes, off, self._std))
-        return _Trial(u, shown.wires, fit, fit.misfit(), *by_wires)
+        trial = _Trial(u, fit, fit.misfit(), *by_wires)
+        self._least = min(self._least, trial.misfit)
+        is_near = self._most_cells == TRIAL_CELLS and trial.is_close(SHORT_STEP, 0.0)
+        if is_near and self._scale is None:
+            self._scale, self._least = fit.scale_, trial.misfit
+        return trial
 
     def _nearest(self, best: _Trial, short: float, stds: float) -> _Trial:
         """The last trial that is kept, of steps until they are short."""
@@ -168,16 +183,19 @@ class WireSearch:
         are left.
         """
         while left and np.abs(u - best.held).max() > LAST_STEP:
-            trial, left = self._trial(u, best), left - 1
-            if trial.misfit <= best.misfit + LIKELY / best.fit.presses:
+            limit = self._least + LIKELY / best.fit.presses
+            trial, left = self._trial(u), left - 1
+            if trial.misfit <= limit:
                 return trial, left
             u = 0.5 * (best.held + u)
         return best, left
 
 
 def held(wires: WireOhm) -> WireOhm:
-    """These wires, told so that no scan teaches other segments; leads are learned."""
-    return wires._replace(top_log_std=HELD_LOG_STD, bottom_log_std=HELD_LOG_STD)
+    """These wires, told so that no scan teaches others."""
+    return wires._replace(
+        top_log_std=HELD_LOG_STD, bottom_log_std=HELD_LOG_STD, lead_std_ohm=HELD_LEAD_STD_OHM
+    )
 
 
 def likely_wires(
