@@ -77,6 +77,15 @@ def test_only_a_simulated_skin_has_a_truth(run: Run, tmp_path: Path) -> None:
     assert_one_line(run(*again, "--force-port", "truth"), "only emulator:// and simavr:// know it")
 
 
+@pytest.mark.parametrize("option", [("--force-unit", "g"), ("--force-scale", "2")])
+def test_the_truth_has_no_unit(run: Run, tmp_path: Path, option: tuple[str, str]) -> None:
+    """The options of a sensor were taken, and did nothing."""
+    for command in (("record", str(tmp_path / "a.mcap")), ("calibrate", "knead", "a.json")):
+        words = (*command[:-1], "emulator://2x2?scene=knead", command[-1])
+        done = run(*words, "--force-port", "truth", *option)
+        assert_one_line(done, "--force-port truth is in newtons")
+
+
 def test_a_simulated_board_may_be_slower_than_the_host(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -228,7 +228,7 @@ def test_numbers_of_the_firmware_are_those_of_its_source() -> None:
         ("emulator://8x8?stall=-1", "stall"),
         ("emulator://8x8?unit=-1", "unit_id is -1"),
         ("emulator://8x8?foreign=70000", "layout_crc"),
-        ("emulator://8x8?seed=-4", "negative"),
+        ("emulator://8x8?seed=-4", "seed must be 0 or more, not -4"),
         ("emulator://8x8?rows=4", "no option 'rows'"),
         ("emulator://8x8?scene=nothing", "no scene"),
         ("emulator://1x1?scene=ghost", "2x2"),

@@ -51,6 +51,8 @@ FORCE_TARE_S: Final = 2.0
 _MOST_TYPED: Final = 1000
 # In place of a force sensor's port: the forces that a simulated skin knows.
 TRUTH: Final = "truth"
+# A sensor's speed, scale, unit and column, where nobody has told them.
+NO_OPTIONS: Final = (DEFAULT_BAUD, 1.0, "", "")
 
 ForceBaud = Annotated[int, Option(help="speed of the force sensor's port")]
 ForceScale = Annotated[
@@ -88,7 +90,7 @@ def record(
     --tare is 2 then, unless told.
     """
     of_sensor = force_baud, force_scale, force_unit, force_column
-    if not force_port and of_sensor != (DEFAULT_BAUD, 1.0, "", ""):
+    if not force_port and of_sensor != NO_OPTIONS:
         raise ValueError("--force-scale and its like are of a sensor: say --force-port, too")
     if tare_s is None:
         tare_s = FORCE_TARE_S if force_port else 0.0
@@ -142,11 +144,14 @@ def sensor_at(
 ) -> ForceSensor | None:
     """The force sensor at a port; None: the port is `TRUTH`, which this skin knows.
 
-    Raises ValueError where the skin knows no truth.
+    Raises ValueError where the skin knows no truth, or a sensor's option is given beside it.
     """
     if port == TRUTH and skin.true_force_n is None:
         raise ValueError("--force-port truth: only emulator:// and simavr:// know it")
-    return None if port == TRUTH else ForceSensor(port, baud, scale, unit, column)
+    of_sensor = baud, scale, unit, column
+    if port == TRUTH and of_sensor != NO_OPTIONS:
+        raise ValueError("--force-port truth is in newtons: leave --force-scale and its like out")
+    return None if port == TRUTH else ForceSensor(port, *of_sensor)
 
 
 def with_truth(scans: Iterable[Scan], skin: Device, recorder: Recorder) -> Iterator[Scan]:

@@ -89,7 +89,7 @@ def emulated(text: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
     with url.blamed():
         if url.options.get("speed", "1") not in ("0", "1"):
             raise ValueError("speed must be 1, or 0: as fast as scans are taken")
-        seed = url.number("seed", 0)
+        seed = _seed(url)
         faults = faults_of(SkinFaults, url.options)
         scene = _scene(url, url.place, faults)
         settings = BoardSettings(
@@ -110,6 +110,14 @@ def emulated(text: str) -> tuple[EmulatedBoard, Scene, LineFaults]:
         return board, scene, faults_of(LineFaults, url.options, seed=seed)
 
 
+def _seed(url: PortUrl) -> int:
+    """Of all that is random."""
+    seed = url.number("seed", 0)
+    if seed < 0:
+        raise ValueError(f"seed must be 0 or more, not {seed}")
+    return seed
+
+
 def scale_under(scene: Scene, text: str) -> EmulatedScale:
     """The scale under the skin of a scene, by the options of its ``emulator://`` URL.
 
@@ -118,7 +126,7 @@ def scale_under(scene: Scene, text: str) -> EmulatedScale:
     url = PortUrl.of(text)
     with url.blamed():
         rate_hz, lag_s, noise_g = (url.number(name, usual) for name, usual in DEFAULTS.items())
-        seed = url.number("seed", 0)
+        seed = _seed(url)
         return EmulatedScale(
             lambda time_s: float(scene.force_n(time_s).sum()), rate_hz, lag_s, noise_g, seed
         )
@@ -137,7 +145,7 @@ def _scene(url: PortUrl, size: str, faults: SkinFaults | None = None) -> Scene:
     if not (1 <= rows <= LINES_MAX and 1 <= columns <= LINES_MAX):
         raise ValueError(f"a size is as 8x8, from 1x1 to {LINES_MAX}x{LINES_MAX}, not '{size}'")
     name, begin_s = url.options.get("scene", "rest"), url.number_if_given("begin")
-    seed = url.number("seed", 0)
+    seed = _seed(url)
     scene = Scene(name, rows, columns, seed=seed, faults=faults, begin_s=begin_s)
     if "plate" in url.options:
         plate = load_plate(url.options["plate"])
