@@ -14,7 +14,8 @@ few touches that `sparse_fit` finds. If touches are many, as under a fingertip, 
 cells that `matrix` finds.
 
 `touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
-few touches. Where they do not explain the frame, its answer is that of `joint`. Without rest
+few touches. Where they do not explain the frame, or lie as under a fingertip, its answer is that of
+`joint`. Without rest
 readings no cell is known to be untouched, so every frame is for `joint`.
 """
 
@@ -88,8 +89,8 @@ TELLING_SHARE: Final = 0.4
 # Skins of fewer ports are told no such fault. Chosen: on 3x3, a few odd readings spoil a whole
 # frame.
 LEAST_STAYING_PORTS: Final = 16
-# A mean lead is known if its deviation is no larger [ohm]. Then weak cells at the edge of a
-# fingertip cannot pass for it. Chosen: such a lead moves hard cells by a few percent.
+# A mean lead is known if its deviation is no larger [ohm]. Chosen: such a lead moves hard cells by
+# a few percent.
 KNOWN_LEAD_STD_OHM: Final = 50.0
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
 # by less than their rounding.
@@ -233,10 +234,10 @@ class JointEstimator(Estimator):
             ), again
         start = self._start(prior, ports, touches)
         self._belief.before_fit(start, ports)
-        fit_prior = prior
-        if prior.is_soft(start, self._shape):
+        is_soft, fit_prior = prior.is_soft(start, self._shape), prior
+        if is_soft:
             fit_prior = prior.for_soft_touches()
-        elif self._may_lead_mislead:
+        elif not self._knows_wires:
             fit_prior = prior.for_fingertips(start, self._shape)
         self._belief.expect_usual_leads(prior.is_crowded(start))
         fit = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
@@ -246,9 +247,10 @@ class JointEstimator(Estimator):
             # knows better which cells are at rest.
             fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, fit.log_cells)
         self._touches = prior.touches(fit.log_cells)
-        # A palm that was fitted again is doubted by the wide prior all the same. By the narrow one,
-        # cells at the edge of a palm would seem to conduct less than at rest.
-        message = self._doubt(fit_prior, fit)
+        # Soft fingertips, and a palm that was fitted again, are doubted by the wide prior. By the
+        # narrow one, cells at the edge of a palm would seem to conduct less than at rest.
+        is_wide = is_soft or spread_share > PALM_SHARE
+        message = self._doubt(fit_prior if is_wide else prior, fit)
         # A palm tells of no fault: that so many cells are pressed is a surprise by itself.
         silent = ports.fault or again or spread_share > TELLING_SHARE
         if not silent and ports.current.size >= LEAST_STAYING_PORTS:
@@ -373,10 +375,11 @@ class JointEstimator(Estimator):
         return self._rest_wires_log_std > REST_STD
 
     @property
-    def _may_lead_mislead(self) -> bool:
-        """Whether weak cells at the edge of a fingertip may pass for a lead that nobody knows."""
-        is_read = not all(self._belief.far)
-        return is_read and float(self._belief.means_std()[2]) > KNOWN_LEAD_STD_OHM
+    def _knows_wires(self) -> bool:
+        """Whether weak cells at the edge of a fingertip cannot pass for wires or for a lead."""
+        *layer_stds, lead_std_ohm = self._belief.means_std()[:3].tolist()
+        are_known = max(layer_stds) <= SEGMENT_STD and lead_std_ohm <= KNOWN_LEAD_STD_OHM
+        return are_known or all(self._belief.far)
 
     def _line_ohm(self) -> float:
         """Resistance of the wire of a row or of a column, whichever is more, end to end [ohm]."""
@@ -575,15 +578,14 @@ class TouchEstimator(JointEstimator):
     def _explained_by(self, touches: FewTouches) -> Touched | None:
         """The answer of these few touches.
 
-        None: they do not explain the frame, or leave one of the touched cells uncertain.
+        None: they do not explain the frame, or leave one of the touched cells uncertain. Or they
+        lie as under a fingertip, at whose edge cells seem untouched that are not.
         """
         # Where wires are assumed, the fit of all resistances teaches them sooner.
         if self.knowledge.rest_ratio is None or self._belief.is_assumed:
             return None
-        # Cells at the edge of a fingertip seem untouched here.
         assert self._prior is not None
-        tips = self._prior.fingertips(touches.log_cells, self._shape)
-        if self._may_lead_mislead and tips.any():
+        if not self._knows_wires and self._prior.fingertips(touches.log_cells, self._shape).any():
             return None
         touched = touches.explain()
         if touched and touched.log_cells_std[touched.cells].max(initial=0.0) <= CLEAR_LOG:

@@ -176,7 +176,8 @@ class CellPrior:
 
         Under fingertips, touched cells are neighbours more often than by chance: n touched cells of
         RC, anywhere, make each pair of neighbours a touched one with the probability n (n - 1) /
-        RC / (RC - 1). The cells around such pairs may be touched as well.
+        RC / (RC - 1). The cells around such pairs may be touched as well. On skins of fewer than
+        5x5 cells, no touches lie together so surely.
         """
         touched, nobody = self.rise_stds(log_ohm) > TOUCHED_STDS, np.zeros(log_ohm.size, dtype=bool)
         count, cells = np.count_nonzero(touched), touched.size
@@ -200,8 +201,8 @@ class CellPrior:
         """The prior where cells (RC,) are touched as by fingertips: there, rest is no likelier.
 
         The deviation about rest is wide for all cells within reach of a fingertip. With the narrow
-        one, a large lead would seem more likely than several weak touches beside a hard one,
-        because fewer cells have to leave rest.
+        one, a large lead, or long wires, would seem more likely than several weak touches beside a
+        hard one, because fewer cells have to leave rest.
         """
         near = self.fingertips(log_ohm, shape)
         if not near.any():
