@@ -179,6 +179,19 @@ def test_scans_teach_wires_and_lead_before_presses_do() -> None:
     assert found.both == pytest.approx((120, 180), rel=0.2)  # presses tell less than that
 
 
+@pytest.mark.parametrize("told_ohm", [None, 150.0])
+def test_scans_take_no_place_of_what_was_told(told_ohm: float | None) -> None:
+    """What they taught was taken for told again, which widened the prior."""
+    skin, told = Skin(100.0, 200.0), WireOhm(150.0, told_ohm, top_log_std=0.05)
+
+    def show(wires: WireOhm, most_cells: int) -> Shown:
+        taught = WireOhm(900.0, 900.0, 0.0, 0.01, 0.01, 1.0)
+        return skin.show(wires, most_cells)._replace(wires=taught)
+
+    WireSearch(told, SHAPE, show).found()
+    assert skin.believed[1] == pytest.approx((150, told_ohm or 50))
+
+
 @pytest.mark.parametrize(("ohm", "std_ohm"), [(100.0, 5.0), (500.0, 250.0), (200.0, 400.0)])
 def test_wires_are_a_mean_of_what_presses_do_not_exclude(ohm: float, std_ohm: float) -> None:
     """Two layers of which presses tell this in ohms, and whose logs were expected about 150 ohm."""

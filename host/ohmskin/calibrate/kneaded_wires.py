@@ -24,8 +24,9 @@ wires that they do not exclude (`likely_wires`). Behind wires that are too large
 much force conduct without limit, which w says nothing of. So the mean, too, is tried.
 
 The scans teach wires, too, without any force, because each touch has several cells. Where they do
-so surely (`SURE_LEAD`), the search begins with that, and it is the prior. In the total force, a
-lead looks like a resistance in series with each contact. So the lead is what the scans teach.
+so surely (`SURE_LEAD`), and nobody has told any, it is taken for told: so the search begins there,
+and it is the prior. In the total force, a lead looks like a resistance in series with each contact.
+So the lead is what the scans teach.
 """
 
 from collections.abc import Callable
@@ -146,10 +147,12 @@ class WireSearch:
         told = self._told._replace(lead=lead_ohm, lead_std_ohm=lead_std_ohm)
         taught = self._show(told, FIRST_CELLS).wires
         self._lead = taught.lead_or_usual(USUAL_LEAD_STD_OHM)
+        is_told = [ohm is not None for ohm in self._told[:2]]
         stds = [LAYER_STD if std is None else std for std in taught[3:5]]
-        knows = self._lead[1] < SURE_LEAD * lead_std_ohm or max(stds) < LAYER_STD
-        self._centre, self._std = (p[:2] for p in wire_prior(taught if knows else self._told))
-        is_known = [knows or ohm is not None for ohm in self._told[:2]]
+        is_sure = self._lead[1] < SURE_LEAD * lead_std_ohm or max(stds) < LAYER_STD
+        believed = taught if is_sure and not any(is_told) else self._told
+        self._centre, self._std = (of_wires[:2] for of_wires in wire_prior(believed))
+        is_known = [ohm is not None for ohm in believed[:2]]
         return np.where(is_known, self._centre, np.minimum(self._centre, np.log(START_OHM)))
 
     def _trial(self, u: Float) -> _Trial:
