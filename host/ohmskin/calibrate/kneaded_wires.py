@@ -119,7 +119,6 @@ class WireSearch:
         self._told, self._shape = told, shape
         self._show, self._most_cells = show, FIRST_CELLS
         self._scale: Scale | None = None
-        self._least = np.inf  # L of the most likely trial with these scans
 
     def found(self) -> FoundWires:
         """The wires. Raises ValueError where the force does not follow the skin."""
@@ -128,7 +127,7 @@ class WireSearch:
         # L of more scans is not to be compared with that before, nor L of another filter, which is
         # kept from the first trial near the wires on. So a step that is not short is not taken: it
         # may be one that was too far.
-        self._most_cells, self._least = TRIAL_CELLS, np.inf
+        self._most_cells = TRIAL_CELLS
         step = best.step * best.is_close(SHORT_STEP, CLOSE_STDS[0])
         best = self._nearest(self._trial(best.held + step), LAST_STEP, CLOSE_STDS[1])
         u, stds = likely_wires(best.held, best.change, best.covariance, self._centre, self._std)
@@ -163,10 +162,8 @@ class WireSearch:
         off = self._centre - u
         by_wires = fit.wires(WireSlopes(shown.slopes, off, self._std))
         trial = _Trial(u, fit, fit.misfit(), *by_wires)
-        self._least = min(self._least, trial.misfit)
-        is_near = self._most_cells == TRIAL_CELLS and trial.is_close(SHORT_STEP, 0.0)
-        if is_near and self._scale is None:
-            self._scale, self._least = fit.scale_, trial.misfit
+        if self._most_cells == TRIAL_CELLS and trial.is_close(SHORT_STEP, 0.0):
+            self._scale = fit.scale_
         return trial
 
     def _nearest(self, best: _Trial, short: float, stds: float) -> _Trial:
@@ -180,15 +177,14 @@ class WireSearch:
         return best
 
     def _tried(self, u: Float, best: _Trial, left: int) -> tuple[_Trial, int]:
-        """A trial of u, or halfway to the best one, whose L is no larger than that one's.
+        """A trial of u, or halfway to the best one, that is about as likely as that one or more.
 
         left: how many trials there may be. Returns the best trial if there is none, and how many
         are left.
         """
         while left and np.abs(u - best.held).max() > LAST_STEP:
-            limit = self._least + LIKELY / best.fit.presses
             trial, left = self._trial(u), left - 1
-            if trial.misfit <= limit:
+            if trial.misfit <= best.misfit + LIKELY / best.fit.presses:
                 return trial, left
             u = 0.5 * (best.held + u)
         return best, left
