@@ -21,7 +21,7 @@ larger by more than `LIKELY`, that was too far, and half of the way is tried.
 
 Few presses tell little of the wires, so what is taken at last is no maximum but the mean of all
 wires that they do not exclude (`likely_wires`). Behind wires that are too large, the cells under
-much force conduct without limit, which w says nothing of. So the mean, too, is tried.
+much force conduct without limit, which w says nothing of. So the mean, too, is tried, once.
 
 The scans teach wires, too, without any force, because each touch has several cells. Where they do
 so surely (`SURE_LEAD`), and nobody has told any, it is taken for told: so the search begins there,
@@ -44,9 +44,9 @@ from ohmskin.estimate.prior import LAYER_STD, USUAL_LEAD_STD_OHM
 # A trial takes as many scans as have about so many cells together: the first number in the first
 # trials, the second one after a short step. Chosen: 16x16 cells then take some minutes.
 FIRST_CELLS, TRIAL_CELLS = 60_000, 240_000
-# After the first trial with either number of scans there are at most so many others, and so many of
-# the mean. The steps are logs: the longest one that is taken, the one below which trials take more
-# cells, and the one below which they end.
+# After the first trial with either number of scans there are at most so many others. The steps are
+# logs: the longest one that is taken, the one below which trials take more cells, and the one below
+# which they end.
 TRIALS, LONGEST_STEP, SHORT_STEP, LAST_STEP = 6, 1.5, 0.5, 0.1
 # Trials also end at a step below so many standard deviations of the wires, with the first number of
 # scans and with the second. Chosen: the presses do not tell the wires better.
@@ -132,7 +132,7 @@ class WireSearch:
         best = self._nearest(self._trial(best.held + step), LAST_STEP, CLOSE_STDS[1])
         u, stds = likely_wires(best.held, best.change, best.covariance, self._centre, self._std)
         if np.abs(u - best.held).max() > LAST_STEP:
-            best, _ = self._tried(u, best, TRIALS)
+            best, _ = self._tried(u, best, 1)
             u = best.held
         (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(u).tolist(), stds.tolist()
         lead_ohm, lead_std_ohm = self._lead

@@ -130,13 +130,13 @@ class Kneading:
         calibrator = self._calibrator
         if not lags:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
-        wires = calibrator.knowledge.nominal_wire_ohm
-        if not calibrator.shows_wires:
+        wires, are_sure = calibrator.knowledge.nominal_wire_ohm, not calibrator.shows_wires
+        if are_sure:
             search = WireSearch(wires, self.shape, partial(self._shown, log))
             calibrator.take_wires(search.found())
             # The curves are of the wires that were found, and not of what scans would teach.
             wires = held(calibrator.knowledge.nominal_wire_ohm)
-        levels = self._levels(calibrator.method, wires, self._spaced(), progress)
+        levels = self._levels(calibrator.method, wires, self._spaced(), progress, are_sure=are_sure)
         calibrator.estimator = levels.estimator
         return TotalFit(self._totals(levels, log)).fit()
 
@@ -179,11 +179,18 @@ class Kneading:
         return Shown(self._totals(levels, log), self._slopes(wires, levels), wires)
 
     def _levels(
-        self, method: str, wires: WireOhm, used: Bool, progress: Progress = iter
+        self,
+        method: str,
+        wires: WireOhm,
+        used: Bool,
+        progress: Progress = iter,
+        *,
+        are_sure: bool = False,
     ) -> _Levels:
         """What a method shows of the scans to use, (n,); those that it doubts are left out.
 
         wires: what is known of them. What a recording teaches of them is known in the next one.
+        are_sure: whether they are as told, and not on trial.
         """
         pressed = self._press >= 0
         pauses = np.flatnonzero(used & ~pressed)
@@ -195,7 +202,8 @@ class Kneading:
         numbers, doubt = np.flatnonzero(wanted), ""
         scans = zip(numbers, progress([self._scans[n] for n in numbers]), strict=True)
         for recording, given in groupby(scans, lambda scan: self._recording[scan[0]]):
-            knowledge = replace(self._knowledge[recording], nominal_wire_ohm=wires)
+            known = self._knowledge[recording]
+            knowledge = replace(known, nominal_wire_ohm=wires, are_wires_sure=are_sure)
             estimator = make_estimator(method, knowledge)
             rest = rests[recording] = estimator.rest_level().ravel()
             for n, scan in given:

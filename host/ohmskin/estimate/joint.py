@@ -89,9 +89,6 @@ TELLING_SHARE: Final = 0.4
 # Skins of fewer ports are told no such fault. Chosen: on 3x3, a few odd readings spoil a whole
 # frame.
 LEAST_STAYING_PORTS: Final = 16
-# A mean lead is known if its deviation is no larger [ohm]. Chosen: such a lead moves hard cells by
-# a few percent.
-KNOWN_LEAD_STD_OHM: Final = 50.0
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
 # by less than their rounding.
 LEAD_MOVE_OHM: Final = 20.0
@@ -377,9 +374,7 @@ class JointEstimator(Estimator):
     @property
     def _knows_wires(self) -> bool:
         """Whether weak cells at the edge of a fingertip cannot pass for wires or for a lead."""
-        *layer_stds, lead_std_ohm = self._belief.means_std()[:3].tolist()
-        are_known = max(layer_stds) <= SEGMENT_STD and lead_std_ohm <= KNOWN_LEAD_STD_OHM
-        return are_known or all(self._belief.far)
+        return self.knowledge.are_wires_sure or all(self._belief.far)
 
     def _line_ohm(self) -> float:
         """Resistance of the wire of a row or of a column, whichever is more, end to end [ohm]."""

@@ -174,6 +174,8 @@ class SkinKnowledge:
     nominal_wire_ohm: what is known of the wires.
     reading_names: the names of the readings of each cell, in their order.
     may_be_bent: whether the skin may have been bent since its wires were measured.
+    are_wires_sure: whether wires and leads are as told, so that weak cells beside hard ones are not
+        taken for other ones. Told wires seldom are.
     ref_log_std: standard deviation of the log of the references, for an error that both have in
         common; 0: they are exact. All resistances then have this error, and no reading shows it,
         because readings are ratios.
@@ -188,6 +190,7 @@ class SkinKnowledge:
     nominal_wire_ohm: WireOhm = NO_WIRES
     reading_names: tuple[str, ...] = NEAR
     may_be_bent: bool = True
+    are_wires_sure: bool = False
     ref_log_std: float = 0.0
 
     def __post_init__(self) -> None:
