@@ -125,21 +125,35 @@ def test_fingertips_alone_show_the_lead_at_far_ends() -> None:
     assert lead_ohm == pytest.approx(behind.rest.lead_ohm.mean(), rel=0.1)
 
 
+def fingertip(shape: tuple[int, int], random: np.random.Generator) -> Float:
+    """Each cell's share of the force of a fingertip somewhere, which fades to nothing."""
+    rows, columns = np.indices(shape)
+    row, column = random.uniform(0, np.array(shape) - 1)
+    pressure = np.exp(
+        -((rows - row) ** 2 + (columns - column) ** 2) / random.uniform(0.7, 1.2) ** 2
+    )
+    pressure[pressure < 0.01 * pressure.max()] = 0.0
+    return np.asarray(pressure / pressure.sum())
+
+
+def pressed(rest: Skin, force_n: Float, gain: Float | float = 1.0) -> Skin:
+    """The skin under these forces. Conductance fades faster than force, as a power of it.
+
+    So cells at the edge of a fingertip rise by less than they conduct at rest.
+    """
+    contact = 30e-6 * force_n**1.5 * gain
+    return replace(rest, cell_siemens=rest.cell_siemens + contact / (1 + 250 * contact))
+
+
 def hard_fingertips(seed: int) -> Trial:
     """60 of them on a skin without leads."""
     random = np.random.default_rng(seed)
     rest = skin_at_rest(8, 8, random, wire_ohm=(100.0, 200.0))
-    rows, columns = np.indices(rest.shape)
     frames = []
     for _ in range(60):
-        row, column = random.uniform(0, 7, 2)
-        width, force_n = random.uniform(0.7, 1.2), random.uniform(8, 12)
-        pressure = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / width**2)
-        pressure[pressure < 0.01 * pressure.max()] = 0.0
-        contact = 30e-6 * (force_n * pressure / pressure.sum()) ** 1.5
-        contact *= np.exp(0.2 * random.standard_normal(rest.shape))
-        rise = contact / (1 + 250 * contact)
-        frames.append(replace(rest, cell_siemens=rest.cell_siemens + rise))
+        shares, force_n = fingertip(rest.shape, random), random.uniform(8, 12)
+        gain = np.exp(0.2 * random.standard_normal(rest.shape))
+        frames.append(pressed(rest, force_n * shares, gain))
     return trial_of(rest, frames, (100.0, 200.0))
 
 
@@ -159,24 +173,14 @@ def test_a_lead_that_is_told_takes_no_place_of_weak_cells_under_a_fingertip(seed
         assert answer.cell_siemens.max() == pytest.approx(true.max(), rel=0.2)
 
 
-def soft_tips(wire_ohm: tuple[float, float], seed: int, size: int = 8) -> Trial:
-    """Fingertips whose pressure fades to nothing, as balls have it, pressed ever harder.
-
-    Conductance grows with a power of the force: so it fades faster than the pressure, and the cells
-    at the edge of a fingertip rise by less than they conduct at rest.
-    """
+def soft_fingertips(wire_ohm: tuple[float, float], seed: int, size: int = 8) -> Trial:
+    """Twelve of them, each pressed ever harder."""
     random = np.random.default_rng(seed)
     rest = skin_at_rest(size, size, random, wire_ohm=wire_ohm)
-    row, column = np.indices((size, size))
     frames = []
     for _ in range(12):
-        i, j = random.uniform(0, size - 1, 2)
-        pressure = np.exp(-((row - i) ** 2 + (column - j) ** 2) / random.uniform(0.7, 1.2) ** 2)
-        pressure[pressure < 0.01 * pressure.max()] = 0.0
-        for force_n in random.uniform(2, 12) * np.array([0.3, 0.7, 1.0]):
-            siemens = 3e-5 * (force_n * pressure / pressure.sum()) ** 1.5
-            siemens /= 1 + 250 * siemens
-            frames.append(replace(rest, cell_siemens=rest.cell_siemens + siemens))
+        shares, most_n = fingertip(rest.shape, random), random.uniform(2, 12)
+        frames += [pressed(rest, share * most_n * shares) for share in (0.3, 0.7, 1.0)]
     return trial_of(rest, frames)
 
 
@@ -184,7 +188,7 @@ def soft_tips(wire_ohm: tuple[float, float], seed: int, size: int = 8) -> Trial:
 def test_the_soft_edge_of_a_fingertip_passes_for_no_lead(wire_ohm: tuple[float, float]) -> None:
     """One such fingertip taught a lead of 3.2 kohm where there was none."""
     for seed in range(4):
-        trial = soft_tips(wire_ohm, seed)
+        trial = soft_fingertips(wire_ohm, seed)
         answers, lead_ohm = estimates(trial, "joint", None)
         assert lead_ohm < 500
         assert np.median(errors(trial, answers)[0]) < 0.05
@@ -197,7 +201,7 @@ def test_the_soft_edge_of_a_fingertip_passes_for_no_long_wires(
 ) -> None:
     """Where wires are told, but not exactly. Peaks of 4 and 1000 times the truth were read."""
     for seed, size in product(range(4), (8, 16)):
-        trial = soft_tips((100.0, 200.0), seed, size)
+        trial = soft_fingertips((100.0, 200.0), seed, size)
         given = trial.rounded(10)
         wires = given.knowledge(0).nominal_wire_ohm._replace(lead=lead_ohm)
         estimator = make_estimator(method, replace(given.knowledge(0), nominal_wire_ohm=wires))

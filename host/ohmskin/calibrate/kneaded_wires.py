@@ -23,10 +23,10 @@ Few presses tell little of the wires, so what is taken at last is no maximum but
 wires that they do not exclude (`likely_wires`). Behind wires that are too large, the cells under
 much force conduct without limit, which w says nothing of. So the mean, too, is tried, once.
 
-The scans teach wires, too, without any force, because each touch has several cells. Where they do
-so surely (`SURE_LEAD`), and nobody has told any, it is taken for told: so the search begins there,
-and it is the prior. In the total force, a lead looks like a resistance in series with each contact.
-So the lead is what the scans teach.
+Without any force, the scans teach wires, too, because each touch has several cells. Where they are
+sure of them (`SURE_LEAD`), and nobody has told any, these wires count as told: the search begins
+with them, and they are the prior. In the total force, a lead looks like a resistance in series with
+each contact. So the lead is what the scans teach.
 """
 
 from collections.abc import Callable

@@ -15,8 +15,7 @@ cells that `matrix` finds.
 
 `touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
 few touches. Where they do not explain the frame, or lie as under a fingertip, its answer is that of
-`joint`. Without rest
-readings no cell is known to be untouched, so every frame is for `joint`.
+`joint`. Without rest readings no cell is known to be untouched, so every frame is for `joint`.
 """
 
 from dataclasses import replace

@@ -174,8 +174,8 @@ class SkinKnowledge:
     nominal_wire_ohm: what is known of the wires.
     reading_names: the names of the readings of each cell, in their order.
     may_be_bent: whether the skin may have been bent since its wires were measured.
-    are_wires_sure: whether wires and leads are as told, so that weak cells beside hard ones are not
-        taken for other ones. Told wires seldom are.
+    are_wires_sure: whether wires and leads are just as told. Else weak cells beside hard ones may
+        look like longer wires, and `joint` takes care that they do not.
     ref_log_std: standard deviation of the log of the references, for an error that both have in
         common; 0: they are exact. All resistances then have this error, and no reading shows it,
         because readings are ratios.

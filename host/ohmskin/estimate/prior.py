@@ -40,8 +40,8 @@ HIDDEN_LOG: Final = 0.3
 CLEAR_LOG: Final = 0.1
 # Under fingertips a larger share of the cells is touched: the frame is crowded.
 CROWDED_SHARE: Final = 0.3
-# Of fingertips, a frame has at least so many touched cells, and more touched neighbours than by
-# chance, by so many deviations of a Poisson distribution.
+# A frame of fingertips has at least so many touched cells. And it has more pairs of touched
+# neighbours than by chance, by so many deviations of a Poisson distribution.
 LEAST_TIP: Final = 3
 CHANCE_STDS: Final = 3.0
 # Under a palm, the touch is spread over a larger share of the cells (`CellPrior.spread_share`).
@@ -179,15 +179,15 @@ class CellPrior:
         RC / (RC - 1). The cells around such pairs may be touched as well. On skins of fewer than
         5x5 cells, no touches lie together so surely.
         """
-        touched, nobody = self.rise_stds(log_ohm) > TOUCHED_STDS, np.zeros(log_ohm.size, dtype=bool)
+        touched = self.rise_stds(log_ohm) > TOUCHED_STDS
         count, cells = np.count_nonzero(touched), touched.size
         if count < LEAST_TIP:  # as in most frames: this saves a tenth of their time
-            return nobody
+            return np.zeros_like(touched)
         on = touched.reshape(shape)
         in_rows, in_columns = on[:, 1:] & on[:, :-1], on[1:] & on[:-1]
         chance = (in_rows.size + in_columns.size) * count * (count - 1) / cells / (cells - 1)
         if in_rows.sum() + in_columns.sum() <= chance + CHANCE_STDS * chance**0.5:
-            return nobody
+            return np.zeros_like(touched)
         pairs = np.zeros((shape[0] + 2, shape[1] + 2), dtype=bool)  # with a margin
         inside = pairs[1:-1, 1:-1]
         inside[:, 1:] |= in_rows
