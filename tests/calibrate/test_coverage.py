@@ -68,9 +68,9 @@ def test_every_number_of_a_scale_that_prints_ten_a_second_is_news() -> None:
         coverage.add(at_s, np.array([1e-5, 0.0]), 1.0)
 
 
-def record_kneading(path: Path, seconds: float, seed: int) -> Recording:
+def record_kneading(path: Path, seconds: float, seed: int, more: str = "") -> Recording:
     """A skin of 2x3 that is kneaded over a sensor whose zero is at 3 N."""
-    url = f"emulator://2x3?scene=knead&begin=1.5&speed=0&seed={seed}&rate=40"
+    url = f"emulator://2x3?scene=knead&begin=1.5&speed=0&seed={seed}&rate=40{more}"
     with ohmskin.open(url) as skin, Recorder(path, skin.info, lambda: skin.now_s) as recorder:
 
         def beside(scan: ohmskin.Scan) -> None:
@@ -98,6 +98,28 @@ def test_a_recording_is_looked_at_as_it_was_live(tmp_path: Path) -> None:
     assert (later.known == (later.log_std <= 0.15)).all()
     assert not live.is_done
     assert live.numbers_left > 0  # it has seen some presses alone
+
+
+def test_a_cell_is_silent_when_much_was_pressed_since_all_others_are_known(tmp_path: Path) -> None:
+    """A cell that nobody has pressed yet is no dead one."""
+    given = record_kneading(tmp_path / "a.mcap", 24.0, 1, "&dead=1,1")
+    live, since = LiveCoverage(given.hellos[0]), 0
+    for scan, force in zip(given.scans, given.forces, strict=True):
+        assert not live.silent.any()
+        assert not live.is_done
+        is_news = live.look(scan, given.tares[0] if scan.host_time_s > 1.2 else None, force)
+        since = since + is_news if live.known.sum() == 5 else 0
+        if since > 0:
+            assert live.next_cell == (1, 1) or live.silent.any()
+        if live.silent.any():
+            break
+    assert since == 51  # numbers, the first of which has made the other cells known
+    assert np.argwhere(live.silent).tolist() == [[1, 1]]
+    assert live.is_done == (live.numbers_left == 0)
+    assert live.next_cell != (1, 1)
+    live.look_at(record_kneading(tmp_path / "b.mcap", 12.0, 1))  # it was mended
+    assert live.is_done
+    assert not live.silent.any()
 
 
 def test_numbers_of_a_gap_of_the_scans_tell_nothing(tmp_path: Path) -> None:

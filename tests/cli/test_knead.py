@@ -70,6 +70,19 @@ def test_a_skin_is_kneaded_until_every_cell_is_known(run: Run, tmp_path: Path) -
     assert out.stat().st_mtime > newest_s
 
 
+def test_a_dead_cell_is_named_and_not_waited_for(run: Run, tmp_path: Path) -> None:
+    """All other cells were known after 10 s, and it never ended by itself."""
+    out = tmp_path / "skin.json"
+    knead = ("calibrate", "knead", f"{SKIN}&scene=knead&dead=1,1", str(out), *TRUTH)
+    done = well(run(*knead, "--seconds", "60"))
+    assert "5 of 6 cells are known to 15 %, these never answered: 1,1 ('ohmskin doctor'" in done.out
+    assert "the same command goes on" not in done.out.splitlines()[-1]
+    assert load_recording(tmp_path / "skin.knead-1.mcap").scans[-1].host_time_s < 40.0
+    assert load_calibration(out).model.pooled.tolist() == [[False] * 3, [False, True, False]]
+    again = well(run(*knead))  # all is known that can be, and nothing is recorded
+    assert "touch nothing" not in again.out
+
+
 def test_kneading_goes_on_where_it_was_ended(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "skin.json"
     command = ("calibrate", "knead", f"{SKIN}&scene=knead&begin=3", str(out), *TRUTH)

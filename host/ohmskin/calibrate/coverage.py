@@ -61,6 +61,12 @@ NEWS_S: Final = 0.08
 # A skin is known when the scale has shown so many numbers for each of its cells. Chosen: those of
 # one or two presses a cell. The curve of all cells and the wires, which are not in t, need them.
 NUMBERS_A_CELL: Final = 8
+# A cell whose t has a larger deviation does not answer. Chosen: a little less than that of a cell
+# that nobody presses, so that some numbers which are wrong make no dead cell answer.
+SILENT_LOG: Final = 0.9 * GAIN_STD
+# Since all other cells are known, the scale must have shown so many numbers for each cell that does
+# not answer. Chosen: those of five seconds of presses, which should reach it if it is alive.
+NUMBERS_A_SILENT_CELL: Final = 50
 # A smaller force is not counted [N]. Chosen: the error of a scale's zero is a large share of it.
 LEAST_N: Final = 0.3
 # So many numbers below zero during touches, and more than above zero, show a scale whose sign is
@@ -112,6 +118,8 @@ class LiveCoverage:
         self._coverage = Coverage(board.rows * board.columns)
         self.log_std = self._coverage.log_std().reshape(board.rows, board.columns)
         self._least = 0  # numbers that are needed
+        # How many cells are not known, and since which number so many do not answer.
+        self._unknown, self._since = self.log_std.size, 0
         self.ask_more()
         self.begin()
 
@@ -153,6 +161,9 @@ class LiveCoverage:
         self._above += 1
         self._coverage.add(sample.host_time_s, rise.ravel(), force_n)
         self.log_std = self._coverage.log_std().reshape(self.log_std.shape)
+        unknown = ~self.known
+        if unknown.sum() != self._unknown or (self.log_std[unknown] < SILENT_LOG).any():
+            self._unknown, self._since = int(unknown.sum()), self._coverage.numbers
         return True
 
     def look_at(self, recording: Recording) -> None:
@@ -184,17 +195,24 @@ class LiveCoverage:
         return np.asarray(self.log_std <= KNOWN_LOG)
 
     @property
+    def silent(self) -> Bool:
+        """Which cells do not answer, though all others are known and more was pressed, (R, C)."""
+        waited = self._coverage.numbers - self._since
+        return ~self.known & (waited >= NUMBERS_A_SILENT_CELL * self._unknown)
+
+    @property
     def numbers_left(self) -> int:
         """How many numbers of the scale are still needed for curve and wires."""
         return max(self._least - self._coverage.numbers, 0)
 
     @property
     def is_done(self) -> bool:
-        """Whether all cells, the curve and the wires are known."""
-        return bool(self.known.all()) and not self.numbers_left
+        """Whether all cells that answer, the curve and the wires are known."""
+        return bool((self.known | self.silent).all()) and not self.numbers_left
 
     @property
     def next_cell(self) -> tuple[int, int]:
-        """The cell that is known least: where to press next."""
-        row, column = np.unravel_index(np.argmax(self.log_std), self.log_std.shape)
+        """The cell that is known least, of those that answer: where to press next."""
+        log_std = np.where(self.silent, 0.0, self.log_std)
+        row, column = np.unravel_index(np.argmax(log_std), log_std.shape)
         return int(row), int(column)

@@ -77,6 +77,9 @@ class KneadMap:
         text = f"{known.sum()} of {known.size} cells are known to {100 * KNOWN_LOG:.0f} %"
         if left := self._coverage.numbers_left:
             text += f", the wires need {left} more numbers of the scale"
+        if silent := np.argwhere(self._coverage.silent).tolist():
+            cells = " ".join(f"{row},{column}" for row, column in silent)
+            text += f", these never answered: {cells} ('ohmskin doctor' looks for the cause)"
         return text if self._coverage.is_done else f"{text}, press at row {row}, column {column}"
 
     def picture(self) -> Group:
@@ -99,7 +102,7 @@ def kneaded(
     """What was kneaded before, and now, until all cells are known or Ctrl-C comes.
 
     scale: as `sensor_at` takes it. view: show the map on a page, too. Returns all recordings, and
-    whether all cells are known.
+    whether all cells that answer are known.
     """
     before, path = session_paths(out, "knead")
     recordings = [load_recording(each) for each in before]
