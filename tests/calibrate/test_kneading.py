@@ -106,6 +106,19 @@ def test_the_filter_of_a_scale_is_found(scale: Scale) -> None:
     assert found.length_s == pytest.approx(scale.length_s, abs=0.04)
 
 
+def test_a_pause_of_hours_does_not_blur_what_a_scale_shows() -> None:
+    """Its filter was computed in steps of 0.3 s, and its length came out as none."""
+    scale, (time_s, _, force_n) = Scale(0.1, 0.1), presses(1, 60)
+    total_n, at_s = force_n.sum(axis=1), np.arange(1.0, 36.0, 0.1)
+    whole_n = scale.shown(time_s, total_n[:, None], at_s)[:, 0]
+    far = np.abs(at_s - 18.0) > 1.0
+    time_s, at_s = (each + 6 * 3600.0 * (each > 18.0) for each in (time_s, at_s))
+    shown_n = scale.shown(time_s, total_n[:, None], at_s)[:, 0]
+    assert shown_n[far] == pytest.approx(whole_n[far], abs=0.02)
+    found = fit_scale(time_s, total_n, at_s, whole_n, 1.0 * far)
+    assert (found.delay_s, found.length_s) == pytest.approx((0.1, 0.1), abs=0.01)
+
+
 def late(seed: int, count: int, step_s: float) -> tuple[Float, Float]:
     """When numbers were printed, and when they arrived: a busy machine lets most of them wait."""
     random = np.random.default_rng(seed)

@@ -36,8 +36,11 @@ LENGTHS_S: Final = (0.02, 0.1, 0.3)
 EARLIEST_S: Final = -0.1
 # Filters are computed on a grid of half a scan, or of this, the longer [s].
 LEAST_STEP_S: Final = 0.01
-# The grid has at most so many points for each scan, however long a pause or a jump of the clock
-# makes it. Chosen: twenty times as many as scans without a pause have.
+# A longer pause of the scans counts as so long on the grid [s]. Chosen: no filter remembers a force
+# for longer.
+LONGEST_PAUSE_S: Final = 10.0
+# The grid has at most so many points for each scan, however many pauses make it longer. Chosen:
+# twenty times as many as scans without a pause have.
 MOST_POINTS: Final = 40
 # So many columns of forces are filtered at once. Chosen: a fit of 16x16 cells has 500 columns, and
 # all of them on the grid took half a gigabyte.
@@ -135,6 +138,10 @@ class Scale:
         """`shown` of all columns at once."""
         from scipy.signal import lfilter
 
+        # Nothing is known of the force in a pause, so the grid shall not be coarser for its sake.
+        cut_s = np.cumsum(np.maximum(np.diff(time_s, prepend=time_s[0]) - LONGEST_PAUSE_S, 0.0))
+        at_s = at_s - np.interp(at_s, time_s, cut_s)
+        time_s = time_s - cut_s
         longest_s = float(time_s[-1] - time_s[0]) / (MOST_POINTS * time_s.size)
         step_s = max(LEAST_STEP_S, 0.5 * float(np.median(np.diff(time_s))), longest_s)
         grid_s = np.arange(time_s[0], time_s[-1] + step_s, step_s)
