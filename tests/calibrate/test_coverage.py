@@ -173,6 +173,23 @@ def test_recordings_are_joined_on_one_clock_and_zero(tmp_path: Path) -> None:
     assert [given.tares for given in whole] == [given.tares for given in both]
 
 
+@pytest.mark.parametrize("scale_s", [(-150.0, 0.0), (5.0, 150.0)], ids=["before", "after"])
+def test_forces_without_scans_are_not_amid_those_of_another_recording(
+    tmp_path: Path, scale_s: tuple[float, float]
+) -> None:
+    """They were, and the log was refused: "time_s ... must be later than the one before"."""
+    both = [record_kneading(tmp_path / f"{n}.mcap", 4.0, n) for n in (1, 2)]
+    expected = [len(given.forces) for given in both]
+    for given in both:
+        alone = [ForceSample(3.0, at_s) for at_s in np.arange(*scale_s, 0.5).tolist()]
+        given.forces = sorted([*given.forces, *alone], key=lambda force: force.host_time_s)
+    whole = joined(both)
+    time_s = [force.host_time_s for given in whole for force in given.forces]
+    assert (np.diff(time_s) > 0).all()
+    for given, count in zip(whole, expected, strict=True):
+        assert count < len(given.forces) < count + 2 * 34  # those within 33 s of the scans stay
+
+
 def test_a_recording_that_was_removed_hides_no_later_one(tmp_path: Path) -> None:
     for number in (2, 3, 10):
         (tmp_path / f"skin[1].knead-{number}.mcap").touch()

@@ -59,9 +59,10 @@ def joined(recordings: list[Recording]) -> list[Recording]:
     """Those that have scans and a rest, on one clock, with the tares that are good for the scans.
 
     The rest moves from day to day, so each keeps its own. What the force sensor shows while nothing
-    touches the skin, up to the tare, is taken off the forces of each. Of several forces of one
-    time, the last counts. Raises ValueError if there is none, or if they are not of one skin in one
-    mode.
+    touches the skin, up to the tare, is taken off the forces of each. Forces long before its scans,
+    or long after them, would come amid those of another: they are left out. Of several forces of
+    one time, the last counts. Raises ValueError if there is no recording, or if they are not of one
+    skin in one mode.
     """
     usable = []
     for given in recordings:
@@ -74,7 +75,8 @@ def joined(recordings: list[Recording]) -> list[Recording]:
     whole: list[Recording] = []
     end_s, end_us = 0.0, 0
     for given in usable:
-        later_s = end_s + PAUSE_S - given.scans[0].host_time_s
+        first_s, last_s = given.scans[0].host_time_s, given.scans[-1].host_time_s
+        later_s = end_s + PAUSE_S - first_s
         later_us = end_us + round(1e6 * PAUSE_S) - given.scans[0].time_us
         scans = [
             replace(s, host_time_s=s.host_time_s + later_s, time_us=s.time_us + later_us)
@@ -84,6 +86,7 @@ def joined(recordings: list[Recording]) -> list[Recording]:
         forces = [
             replace(f, force_n=f.force_n - zero_n, host_time_s=f.host_time_s + later_s)
             for f in {f.host_time_s: f for f in given.forces}.values()
+            if first_s - PAUSE_S / 3 < f.host_time_s < last_s + PAUSE_S / 3
         ]
         whole.append(replace(given, scans=scans, forces=forces))
         end_s, end_us = scans[-1].host_time_s, scans[-1].time_us
