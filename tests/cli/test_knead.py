@@ -247,6 +247,8 @@ def test_lines_of_the_scale_that_could_not_be_read_are_counted(
     command = ("calibrate", "knead", f"{SKIN}&scene=knead", str(tmp_path / "skin.json"))
     done = run(*command, "--force-port", "scale", "--seconds", "3")
     assert "0 forces, 2 lines that could not be read: 0 of 6 cells" in done.out
+    # It was "not enough values to unpack".
+    assert_one_line(done._replace(out=""), "no force was recorded while the skin was scanned")
 
 
 class Weighing(TwoBadLines):

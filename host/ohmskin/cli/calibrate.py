@@ -312,6 +312,8 @@ def _learn_totals(calibrator_of: _CalibratorOf, recordings: list[Recording], out
 
 def _log_in(forces: list[ForceSample], *, any_zero: bool = False) -> ForceLog:
     """The forces in recordings, whose times are by the same clock as those of the scans."""
+    if not forces:
+        raise ValueError("no force was recorded while the skin was scanned")
     time_s, force_n = np.array([(sample.host_time_s, sample.force_n) for sample in forces]).T
     if not {sample.source for sample in forces} & {WEIGHTS, TRUTH}:
         time_s = printed_s(time_s)
