@@ -524,3 +524,10 @@ def test_total_and_an_indenter_exclude_each_other(run: Run, tmp_path: Path) -> N
     for options in ((), both):
         done = run("calibrate", "recording", *paths, *options)
         assert_one_line(done)
+
+
+def test_json_without_total_is_refused(run: Run, tmp_path: Path) -> None:
+    """It was taken, and words were printed all the same."""
+    paths = str(tmp_path / "a.mcap"), str(tmp_path / "b.json")
+    done = run("calibrate", "recording", *paths, "--indenter-mm2", "80", "--json")
+    assert_one_line(done, "--json is for --total")

@@ -222,6 +222,8 @@ def recording(
     """
     if total == (indenter_mm2 is not None):
         raise ValueError("say either --indenter-mm2, of presses of single cells, or --total")
+    if as_json and not total:
+        raise ValueError("--json is for --total")
     told = wires_of(wires, leads)
     calibrator_of = _options(out, method, indenter_mm2, told, force, recording, forces)
     given = load_recording(recording)
