@@ -16,6 +16,7 @@ error_*         error of a pressed cell, median and 90th percentile: of the firs
 told_*_worst    the worst total where the wires are told: the nominal 100 and 200 ohm.
 nothing_*       total and error of all frames, and pressed cells within 4 stated deviations, where
                 nobody has told either that there are no leads. All other figures are told that.
+stated_*        median stated deviation of a pressed cell over its median error.
 mixed_*         the same fingertips on skins with wires of 20 ohm to 1 kohm a segment, not told:
                 90th percentile of the total's error, pressed cells within 4 stated deviations.
 limit_*         90th percentile of the errors that one frame of them allows whoever knows which
@@ -114,6 +115,9 @@ def of_case(figures: Figures, key: str, cases: dict[str, list[dict[str, Judged]]
     for case, word in (("untold", "total"), ("told", "told"), ("nothing", "nothing")):
         worst = np.exp(np.abs(np.log(np.maximum(total[case], 1e-3))).max())
         figures.put(f"{word}_{key}_worst", worst, 3)
+    for case, word in (("untold", "stated"), ("told", "stated_told")):
+        every = judged[case]
+        figures.put(f"{word}_{key}", np.median(every.stated) / np.median(every.relative))
     for part in ("first", "late"):
         of_part = pooled(skin[part] for skin in cases["untold"])
         figures.put(f"error_{key}_{part}_percent", of_part.error_percent())
@@ -145,6 +149,8 @@ def bars_of(method: str) -> list[Bar]:
         at_most(f"total_{key}_p90", 1.08),
         at_most(f"total_{key}_worst", 1.3),
         at_most(f"told_{key}_worst", 1.1),
+        at_most(f"stated_{key}", 6),
+        at_most(f"stated_told_{key}", 3),
         at_most(f"error_{key}_first_percent", 3.5),
         at_most(f"error_{key}_first_p90_percent", 10),
         at_most(f"error_{key}_late_percent", 2.5),

@@ -41,8 +41,8 @@ from ohmskin.estimate.prior import (
     LAYER_STD,
     REST_STD,
     SEGMENT_STD,
-    UNKNOWN_LAYER_STD,
     UNKNOWN_REST_STD,
+    USUAL_LAYER_STD,
 )
 from ohmskin.link.protocol import ADC_BITS
 from studies.trials import Trial
@@ -74,7 +74,7 @@ def information_limit(
     if rest_std is None:
         rest_std = UNKNOWN_REST_STD if knowledge.rest_ratio is None else REST_STD
     if layer_std is None:
-        layer_std = UNKNOWN_LAYER_STD if knowledge.nominal_wire_ohm.both is None else LAYER_STD
+        layer_std = USUAL_LAYER_STD if knowledge.nominal_wire_ohm.both is None else LAYER_STD
 
     circuit = PortCircuit(skin.cell_siemens, skin.top_wire_ohm, skin.bottom_wire_ohm)
     current = 1.0 / (circuit.port_ohm + knowledge.ref_ohm)

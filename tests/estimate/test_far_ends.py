@@ -148,7 +148,7 @@ def test_readings_may_come_in_any_order_and_polarity(names: str) -> None:
 def test_one_far_end_is_better_than_none(names: str) -> None:
     random = np.random.default_rng(12)
     off: dict[str, list[Float]] = {names: [], "ab": []}
-    for _ in range(6):
+    for _ in range(24):
         rest = skin_at_rest(6, 6, random, wire_ohm=(300.0, 300.0))
         touched = touch(rest, 3, random)
         for each, found in off.items():

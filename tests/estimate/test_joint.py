@@ -220,8 +220,8 @@ def test_a_lesson_has_the_residual_at_the_answer_and_not_one_step_before_it() ->
 def test_what_a_frame_teaches_does_not_change_its_own_deviations(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nobody has told wires and leads; a lesson moves what is believed of them."""
-    given = random_trial(8, 8, 8, 1, seed=5).rounded(10, wires_told=False)
+    """Nobody has told wires and leads; a lesson moves what is believed of them a little."""
+    given = random_trial(8, 8, 8, 1, seed=9).rounded(10, wires_told=False)
     stated = []
     for method in ("joint", "touch"):
         estimator = make_estimator(method, given.knowledge(0))

@@ -12,7 +12,7 @@ from ohmskin.estimate.prior import (
     PALM_SHARE,
     UNTOUCHED_STD,
     CellPrior,
-    WireStds,
+    UpperLimits,
     rest_level,
     siemens_std,
 )
@@ -32,47 +32,49 @@ def test_the_stand_in_normal_has_the_slope_of_the_prior() -> None:
 
 def test_deviations_of_conductances_are_those_of_logs_where_both_are_small() -> None:
     log_siemens, log_std = np.log([1e-6, 1e-5, 1e-4]), np.full(3, 0.001)
-    up, down = siemens_std(
-        log_siemens, log_std, np.zeros(3), np.zeros(3), WireStds(0.1, 1.0, 1.0), np.full(3, 6e4)
-    )
+    certain = UpperLimits(np.zeros(3))
+    up, down = siemens_std(log_siemens, log_std, np.zeros((3, 3)), certain, np.full(3, 6e4))
     np.testing.assert_allclose(up, 0.001 * np.exp(log_siemens), rtol=0.03)
     np.testing.assert_allclose(down, 0.001 * np.exp(log_siemens), rtol=0.03)
 
 
 def test_a_cell_behind_unknown_wires_may_be_a_short() -> None:
     """1 kOhm +- 50 % behind 10 kOhm of wire: two deviations down are nearly nothing."""
-    half, series_ohm = np.array([0.5]), np.array([7e4])
-    up, down = siemens_std(
-        np.log([1e-3]), half, half, np.zeros(1), WireStds(0.05, 1.0, 1.0), series_ohm
-    )
+    half, from_top = np.array([0.5]), np.array([[0.5, 0.0, 0.0]])
+    upper = UpperLimits(np.full(3, 2.1))
+    up, down = siemens_std(np.log([1e-3]), half, from_top, upper, np.array([7e4]))
     assert 1e-3 + 2 * up[0] == pytest.approx(HIGHEST_TOUCH_SIEMENS)
     assert 0 < down[0] < 0.5e-3
 
 
-def test_wires_of_unknown_length_make_a_cell_uncertain_upwards() -> None:
-    """A layer known to a factor of two: two of its deviations up are a factor of four."""
-    part, none, series_ohm = np.array([0.01]), np.zeros(1), np.array([6e4])
-    wires = WireStds(np.log(2.0), 1.0, 1.0)
-    up, down = siemens_std(np.log([1e-5]), part, part, none, wires, series_ohm)
-    assert up[0] == pytest.approx(1e-5 * 0.01 * 3 / np.log(4.0), rel=0.02)
-    assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)
-    # Three of its deviations, where nobody told it, are a factor of eight.
-    up, _ = siemens_std(np.log([1e-5]), part, part, none, wires._replace(reach_stds=3), series_ohm)
-    assert up[0] == pytest.approx(1e-5 * 0.01 * 7 / np.log(8.0), rel=0.05)
-    # A layer that may just have grown longer, by five times the deviation that the fit took.
-    wires = WireStds(np.log(2.0), 5.0, 1.0)
-    up, down = siemens_std(np.log([1e-5]), part, part, none, wires, series_ohm)
-    assert up[0] == pytest.approx(1e-5 * 0.05 * 3 / np.log(4.0), rel=0.2)
-    assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)
+@pytest.mark.parametrize("mean", range(3))
+def test_what_comes_from_means_reaches_to_their_upper_limits(mean: int) -> None:
+    """1 % of 100 kOhm is 1 kOhm for each deviation of the mean that the fit took."""
+    std, by_mean, limits = np.full(1, 0.01), np.zeros((1, 3)), np.full(3, 99.0)
+    by_mean[0, mean], limits[mean] = 0.01, 30.0
+    for count_as in (2.0, 4.0):
+        upper = UpperLimits(limits, count_as)
+        up, down = siemens_std(np.log([1e-5]), std, by_mean, upper, np.full(1, 6e4))
+        assert 1e-5 + count_as * up[0] == pytest.approx(1 / (1e5 - 30 * 1e3))
+        assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)
 
 
-def test_leads_that_may_be_unusual_make_a_cell_uncertain_upwards() -> None:
-    """Ten times as unsure as the fit took them: all of the deviation comes from leads here."""
-    part, none, series_ohm = np.array([0.01]), np.zeros(1), np.array([6e4])
-    wires = WireStds(0.1, 1.0, 10.0)
-    up, down = siemens_std(np.log([1e-5]), part, none, part, wires, series_ohm)
-    assert up[0] == pytest.approx(1e-5 * 0.1, rel=0.2)
-    assert down[0] == pytest.approx(1e-5 * 0.01, rel=0.02)
+def test_a_hard_cell_says_how_long_wires_are_at_most() -> None:
+    """If they were eleven times as long, nothing would be left of it; soft cells lose little."""
+    siemens, by_top = np.array([1e-4, 1e-5, 1e-6]), np.array([0.1, 0.01, 0.001])
+    series_ohm, upper = np.full(3, 6e4), UpperLimits(np.full(3, 1e3))
+    parts = np.stack([by_top, 0 * by_top, 0 * by_top], axis=1)
+    up, _ = siemens_std(np.log(siemens), by_top, parts, upper, series_ohm)
+    left = 1 / (siemens + 2 * up) * siemens
+    np.testing.assert_allclose(left, [300 / 1e4, 0.895, 0.9895], rtol=1e-6)
+    # If as much of that cell may go to the other layer, it is not lost twice.
+    parts[:, 1] = by_top
+    both, _ = siemens_std(np.log(siemens), 2**0.5 * by_top, parts, upper, series_ohm)
+    np.testing.assert_allclose(both[1:], up[1:])
+    # A hard cell that is not known by itself says less.
+    log_std = np.hypot(2**0.5 * by_top, [1.0, 0.0, 0.0])
+    unknown, _ = siemens_std(np.log(siemens), log_std, parts, upper, series_ohm)
+    assert np.all(unknown[1:] > 2 * up[1:])
 
 
 def test_the_level_of_an_untouched_skin_is_found_and_touches_raise_it_little() -> None:

@@ -58,7 +58,7 @@ def test_a_reset_forgets_single_segments() -> None:
         off = np.abs(answer.cell_siemens - fresh.cell_siemens) / fresh.cell_siemens_std
         return float(off.max())
 
-    assert stds_off(again) < 0.1 < stds_off(learned)
+    assert stds_off(again) < 0.3 < stds_off(learned)
 
 
 def pressed(rest: Skin, cell: tuple[int, int]) -> Skin:

@@ -12,8 +12,8 @@ from ohmskin.estimate.prior import (
     LAYER_STD,
     REST_STD,
     SEGMENT_STD,
-    UNKNOWN_LAYER_STD,
     UNKNOWN_REST_STD,
+    USUAL_LAYER_STD,
 )
 from skins import uniform_skin
 from studies.information import PRESSED_STD, information_limit
@@ -81,7 +81,7 @@ def test_what_is_not_known_widens_the_limit() -> None:
     np.testing.assert_array_equal(exactly[~where], 0.0)
     closely = information_limit(skin, told, where, rest_std=1e-4, layer_std=0.01)
     np.testing.assert_allclose(closely, dense_limit(skin, told, where, 1e-4, 0.01), rtol=1e-3)
-    expected = dense_limit(skin, untold, where, UNKNOWN_REST_STD, UNKNOWN_LAYER_STD)
+    expected = dense_limit(skin, untold, where, UNKNOWN_REST_STD, USUAL_LAYER_STD)
     np.testing.assert_allclose(information_limit(skin, untold, where), expected, rtol=1e-3)
     assert np.all(limit[where] < expected[where])
 

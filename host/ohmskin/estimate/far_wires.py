@@ -105,6 +105,10 @@ class MeasuredWires(WireBelief):
             for lines, n in (self.shape, self.shape[::-1])
         ]
 
+    def expect_usual(self, wanted: bool) -> None:
+        """Fits always expect the usual: no lesson shows a layer that is sensed at near ends."""
+        super().expect_usual(True)
+
     def learned(self) -> WireOhm | None:
         """The means as the last frame has shown them, also if it had a fingertip on the skin."""
         return None if self._known.means is self._nominal else self._as_known()
@@ -227,9 +231,9 @@ class MeasuredWires(WireBelief):
     def fix_rest_wires(self) -> None:
         """Expect the wires at rest in later frames, with the variance that a bend adds."""
         prior = np.diagonal(self._prior_covariance)
-        found = np.diagonal(self._root) ** 2
+        found = np.diagonal(self._known.covariance)
         bend = np.array([*np.where(self.far, LAYER_STD**2 + found[:2], prior[:2]), *found[2:]])
-        self._nominal, self._prior_covariance = self.means, np.diag(bend)
+        self._nominal, self._prior_covariance = self._known.means, np.diag(bend)
         self._means_before = self._nominal, bend
 
     def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
@@ -241,10 +245,10 @@ class MeasuredWires(WireBelief):
         offset = self._measure(circuit, ports)
         if self.fault:
             return False
-        variance = np.diagonal(self._root) ** 2
+        variance = np.diagonal(self._known.covariance).copy()
         most = np.diagonal(self._prior_covariance)
         variance[:2] += FADE_SHARE * (most - variance)[:2]  # a bend does not change leads
-        self._means_before = self.means, variance
+        self._means_before = self._known.means, variance
         segments = self.segment_ohm(self.expected_wires)
         for layer in (0, 1):
             if self.far[layer]:

@@ -87,8 +87,8 @@ class FullFit:
 
     log_cells: log resistances of the cells, (RC,) [log ohm].
     log_cells_std: their posterior deviation, (RC,).
-    wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
-    leads_log_std: the part of it that comes from the mean lead, (RC,).
+    by_means_std: the parts of it that come from the means of the top and of the bottom layer, and
+        from the mean lead, (RC, 3).
     means: those of the wires (`wire_belief`), (n,).
     wires: logs of the segments, then the leads [ohm], (2RC + R+C,).
     iterations: steps taken.
@@ -339,8 +339,7 @@ class FullFit:
             learned = wider**2 * learned
             with_means *= wider[:, None]
             cell_std = wider * cell_std
-        self.wires_log_std: Float = cell_std * np.hypot(*with_means[:, :2].T)
-        self.leads_log_std: Float = cell_std * np.abs(with_means[:, 2])
+        self.by_means_std: Float = cell_std[:, None] * np.abs(with_means)
         self.log_cells_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
 
     def _find_unnoticed(self, learned: Float) -> tuple[NDArray[np.bool_], Float]:

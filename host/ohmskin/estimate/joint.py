@@ -235,7 +235,7 @@ class JointEstimator(Estimator):
             fit_prior = prior.for_soft_touches()
         elif not self._knows_wires:
             fit_prior = prior.for_fingertips(start, self._shape)
-        self._belief.expect_usual_leads(prior.is_crowded(start))
+        self._belief.expect_usual(prior.is_crowded(start) or fit_prior is not prior)
         fit = FullFit(fit_prior, self._belief, self.knowledge.ref_ohm, ports, start)
         spread_share = prior.spread_share(fit.log_cells)
         if spread_share > PALM_SHARE and fit_prior is not prior:
@@ -261,7 +261,7 @@ class JointEstimator(Estimator):
             again = False
         else:
             again = self._belief.after_fit(fit, ports, again=again)
-        self._belief.expect_usual_leads(True)
+        self._belief.expect_usual(True)
         return solution, again
 
     def _few_touches(self, prior: CellPrior, ports: PortReadings) -> FewTouches | None:
@@ -317,9 +317,9 @@ class JointEstimator(Estimator):
         wires = belief.believed_wires()
         if isinstance(fit, FullFit):
             wires = belief.wires(fit.wires, fit.means)
-        parts = fit.log_cells_std, fit.wires_log_std, fit.leads_log_std
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
-        std, std_down = siemens_std(-fit.log_cells, *parts, belief.stds(), series_ohm)
+        parts, limits = (fit.log_cells_std, fit.by_means_std), belief.upper_limits()
+        std, std_down = siemens_std(-fit.log_cells, *parts, limits, series_ohm)
         # Where the model misses the readings by more than their noise, or by more than it expects
         # to, it is wrong somewhere. So all variances are widened by the ratio.
         wider = max(1.0, fit.misfit, fit.surprise) ** 0.5
@@ -333,7 +333,7 @@ class JointEstimator(Estimator):
         level_std = std
         if belief.told.told_share:
             parts = belief.parts_of_level(*parts)
-            level_std, _ = siemens_std(-fit.log_cells, *parts, belief.stds(), series_ohm)
+            level_std, _ = siemens_std(-fit.log_cells, *parts, limits, series_ohm)
         level_std = level_std * (level * cell_ohm) ** 2  # cell and level have the same error in ohm
         return Solution(
             cell_siemens=(1.0 / cell_ohm).reshape(self._shape),
@@ -500,7 +500,7 @@ class JointEstimator(Estimator):
         log_cells = fit.log_cells
         self._rest_means = means = self._belief.means
         self._belief.fix_rest_wires()
-        self._rest_wires_log_std = float(fit.wires_log_std.max())
+        self._rest_wires_log_std = float(np.hypot(*fit.by_means_std[:, :2].T).max())
         # Where wires hide even cells at rest, cells depend on the wires too strongly for slopes.
         by_means = np.zeros((log_cells.size, len(means)))
         if not self._hides_rest:

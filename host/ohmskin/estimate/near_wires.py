@@ -30,7 +30,7 @@ A skin bends. So there are two filters. The steady one is for a skin that lies s
 before a lesson, a small share of what it knows of the layers and of single segments fades, so that
 it follows a slow drift. The wary one takes each lesson twice: for wires that are what they were,
 and, with the odds `CHANGED_ODDS`, for wires that have changed since the last lesson, so that no
-more is known of the layers than if nobody had told them (of a skin that may not be bent: than was
+more is known of the layers than that they are usual (of a skin that may not be bent: than was
 told). It goes on with the mixture of both, by its mean and its covariance. (Such a filter is called
 generalized pseudo-Bayesian, of first order: Bar-Shalom, Li, Kirubarajan, *Estimation with
 Applications to Tracking and Navigation*, chapter 11.)
@@ -63,7 +63,7 @@ from ohmskin.estimate.prior import (
     LAYER_STD,
     MEMORY,
     STEADY_FADE,
-    UNKNOWN_LAYER_STD,
+    USUAL_LAYER_STD,
     USUAL_LEAD_STD_OHM,
     WARY_ODDS,
 )
@@ -196,7 +196,7 @@ class LearnedWires(WireBelief):
     def _changed(self, before: _Filter) -> Float:
         """The same, if they have changed altogether."""
         if self._may_be_bent:
-            return self._widened(before, np.full(2, UNKNOWN_LAYER_STD**2))
+            return self._widened(before, np.full(2, USUAL_LAYER_STD**2))
         return self._widened(before, np.diagonal(self._prior_covariance)[:2])
 
     def _widened(self, before: _Filter, layers: Float) -> Float:
@@ -219,4 +219,4 @@ class LearnedWires(WireBelief):
 
     def _wary_layer_stds(self) -> Float:
         wary = self._filters[1]
-        return np.hypot(np.sqrt(wary.covariance.diagonal()), wary.means - self.means)[:2]
+        return np.hypot(np.sqrt(wary.covariance.diagonal()), wary.means - self._known.means)[:2]

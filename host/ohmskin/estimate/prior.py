@@ -51,9 +51,11 @@ SOFT_CORRELATION: Final = 0.5
 
 # A wire segment of a layer whose nominal value nobody has told.
 UNKNOWN_WIRE_OHM: Final = 150.0
-# Deviation that all segments share, of a layer whose nominal value nobody has told: a factor of
-# two.
-UNKNOWN_LAYER_STD: Final = 0.7
+# Deviation that all segments share, of a layer whose nominal value nobody has told: wires of 10 ohm
+# to some kilohms are not unlikely.
+UNKNOWN_LAYER_STD: Final = 1.5
+# The same, if layers are usual ones, or have changed because the skin was bent: a factor of two.
+USUAL_LAYER_STD: Final = 0.7
 # Deviation that all segments share, of a layer whose nominal value is told: stretch, temperature.
 LAYER_STD: Final = 0.3
 # Deviation of each segment from the mean of its layer, and of each lead from the mean lead, as a
@@ -93,9 +95,12 @@ MAX_STEP_LOG: Final = 1.5
 # Where errors are skewed, the limit of so many deviations is computed. The deviation that is stated
 # is the distance to this limit, divided by so many.
 REACH_STDS: Final = 2.0
-# The same for deviations upwards, while nobody has told the wires and no frame has taught them.
-# Chosen: layers of 1 kOhm a segment are 2.7 of their deviations above `UNKNOWN_WIRE_OHM`.
-UNTOLD_REACH_STDS: Final = 3.0
+# While nobody has told the wires and no frame has taught them, their upper limits count as so many
+# deviations away. Chosen: few skins have wires near these limits.
+UNTOLD_REACH_STDS: Final = 4.0
+# Where wires are longer than the fit has them, a cell has lost at most this share of its resistance
+# to them. Chosen: all of it, and what slopes err by.
+MOST_LOST_SHARE: Final = 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,69 +243,63 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
     return float(min(level, HIGHEST_TOUCH_SIEMENS))
 
 
-class WireStds(NamedTuple):
-    """How well the means of a skin's wires are known.
+class UpperLimits(NamedTuple):
+    """How large the means of both layers and of the leads may be.
 
-    layer_std: standard deviation of the log of the mean segment, of the layer that is known less.
-        It allows for wires that may just have changed.
-    layer_std_ratio: such a deviation over the one that fits take, of the layer where it is more.
-    lead_std_ratio: deviation of the mean lead as known, over the one that fits take (under
-        fingertips, fits expect usual leads).
-    reach_stds: how many deviations away the upper limit is.
+    stds: how far above each mean its upper limit is, in the deviations that fits take, (3,).
+    count_as: as how many deviations this counts.
     """
 
-    layer_std: float
-    layer_std_ratio: float
-    lead_std_ratio: float
-    reach_stds: float = REACH_STDS
+    stds: Float
+    count_as: float = REACH_STDS
 
 
 def siemens_std(
     log_siemens: Float,
     log_std: Float,
-    wires_log_std: Float,
-    leads_log_std: Float,
-    wires: WireStds,
+    by_means_std: Float,
+    upper: UpperLimits,
     series_ohm: Float,
 ) -> tuple[Float, Float]:
-    """Standard deviations of conductances, upwards and downwards [S], all (RC,).
+    """Standard deviations of conductances, upwards and downwards [S], both (RC,).
 
-    log_siemens: logs of the conductances [log S].
-    log_std: deviation of the log conductance, to first order.
-    wires_log_std: the part of it that comes from the mean wires of the layers.
-    leads_log_std: the part of it that comes from the mean lead.
-    wires: how well the means are known.
-    series_ohm: leads and wires to the cell, and references [ohm].
+    log_siemens: logs of the conductances, (RC,) [log S].
+    log_std: deviation of the log conductance, to first order, (RC,).
+    by_means_std: the parts of it that come from the means of both layers and of the leads, (RC, 3).
+    upper: of these means.
+    series_ohm: leads and wires to the cell, and references, (RC,) [ohm].
 
     The error of the port current I = 1 / (r + series) is normal, and that of g = 1 / r is not. So
-    the limits of k deviations are found for I, and carried over to g: each deviation stated is the
-    distance from g to its limit, divided by k. k is `wires.reach_stds` upwards, and `REACH_STDS`
-    downwards. Behind much series resistance the upper limit is far away: the cell may conduct as
-    much as the hardest touch.
+    the limits of `REACH_STDS` deviations are found for I, and carried over to g. The deviation is
+    the distance to the limit, divided by so many.
+
+    Upwards, the means have a limit of their own: wires and leads at their upper limits take
+    resistance from the cell. The limits are far away where nobody has told the wires. But no cell
+    has less than no resistance. So the cells that lose most to a mean say how large it is at most:
+    the means may use up all of what such a cell has, whichever of the three they are. Both
+    deviations are added as variances. A cell conducts at most as much as the hardest touch.
     """
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
-    # The cell conducts most if its wires resist most. Wires are normal in their log. So at the
-    # upper limit they are exp(k layer_std) - 1 above their mean, where the first order has
-    # k layer_std. The part of the deviation that comes from wires grows by this ratio. It grows by
-    # a second one, because wires may just have grown longer, which fits do not expect. At the lower
-    # limit, wires are off by less than k layer_std, so there the first order is enough.
-    # The mean lead may be larger than the fit expects, which widens the deviation upwards alone: a
-    # lead cannot be as much smaller, because none is below 0.
-    reach = wires.reach_stds
-    reach_log = reach * wires.layer_std
-    wider = np.expm1(reach_log) / reach_log * wires.layer_std_ratio
-    more = (wider**2 - 1.0) * wires_log_std**2 + (wires.lead_std_ratio**2 - 1.0) * leads_log_std**2
-    up_std = np.sqrt(log_std**2 + more)
     # d log I = - r / (r + series) d log r. So at the limits the current is (1 +- off) I, and the
     # whole resistance is (r + series) / (1 +- off). The cell's is this less `series_ohm`.
-    off_per_std = cell_ohm / (cell_ohm + series_ohm)
-    off_up = reach * up_std * off_per_std
-    off_down = np.minimum(REACH_STDS * log_std * off_per_std, 1.0 - 1e-6)
-    lowest_ohm = (cell_ohm - off_up * series_ohm) / (1.0 + off_up)
+    reach_per_std = REACH_STDS * cell_ohm / (cell_ohm + series_ohm)
+    own_std = np.sqrt(np.maximum(log_std**2 - (by_means_std**2).sum(axis=1), 0.0))
+    off_up, off_down = reach_per_std * own_std, np.minimum(reach_per_std * log_std, 1.0 - 1e-6)
+    own_ohm = (cell_ohm + series_ohm) * off_up / (1.0 + off_up)
     highest_ohm = (cell_ohm + off_down * series_ohm) / (1.0 - off_down)
-    highest = 1.0 / np.maximum(lowest_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
+    # By how many deviations means may rise, as the cells say that lose most to one: (cell, mean).
+    most_stds = (MOST_LOST_SHARE + REACH_STDS * own_std)[:, None] / np.maximum(by_means_std, 1e-12)
+    most_stds = most_stds[most_stds.argmin(axis=0)]
+    most_share = (by_means_std[:, None] * most_stds).max(axis=2).min(axis=1)
+    share = np.minimum(np.linalg.norm(by_means_std * upper.stds, axis=1), most_share)
+
+    def risen_siemens(less_ohm: Float) -> Float:
+        return 1.0 / np.maximum(cell_ohm - less_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS) - siemens
+
+    up_own = risen_siemens(own_ohm) / REACH_STDS
+    up_means = risen_siemens(cell_ohm * share) / upper.count_as
     # A cell may conduct nearly as much as the hardest touch, or more. Then the distance to the
     # limit is too small, or below 0. So no less than the deviation to first order is stated.
-    up = np.maximum(siemens * log_std, (highest - siemens) / reach)
+    up = np.maximum(siemens * log_std, np.hypot(up_own, up_means))
     return np.asarray(up), np.asarray((siemens - 1.0 / highest_ohm) / REACH_STDS)

@@ -46,7 +46,7 @@ class WholeFrame:
         self.log_cells, self.log_cells_std = answer.log_cells, answer.log_cells_std
         if isinstance(answer, RegionFit):
             self.log_cells_std = answer.fitted_std
-        self.wires_log_std, self.leads_log_std = answer.wires_log_std, answer.leads_log_std
+        self.by_means_std = answer.by_means_std
         self.misfit, self.surprise = answer.misfit, answer.surprise
         self.series_ohm = ref_ohm + belief.leads_of_ports @ belief.lead_ohm(belief.means)
         self.net = belief.circuit(answer.log_cells, belief.means, RestNetwork)
@@ -57,8 +57,8 @@ class RegionFit:
     """Fits frames of one region, one after the other.
 
     log_cells, log_cells_std: of all cells, those outside as in the whole frame, (RC,).
-    wires_log_std, leads_log_std: the parts of log_cells_std that come from the means of the layers,
-        and from the mean lead, (RC,).
+    by_means_std: the parts of log_cells_std that come from the means of the top and of the bottom
+        layer, and from the mean lead, (RC, 3).
     modelled: port currents of the model, (RC,) [S]; outside of the region, those that are kept.
     iterations: steps of the last frame.
     misfit, surprise: of the whole frame, because a frame that does not fit gets no answer here.
@@ -68,8 +68,7 @@ class RegionFit:
 
     log_cells: Float
     log_cells_std: Float
-    wires_log_std: Float
-    leads_log_std: Float
+    by_means_std: Float
     fitted_std: Float
     misfit: float
     surprise: float
@@ -149,10 +148,8 @@ class RegionFit:
         # A cell outside changes by the same share as the current of a port that is not read.
         self.log_cells_std = np.hypot(self.fitted_std, STALE_SHARE * self.age)
         self.log_cells_std[region] = self.fitted_std[region]
-        self.wires_log_std = whole.wires_log_std.copy()
-        self.leads_log_std = whole.leads_log_std.copy()
-        self.wires_log_std[region] = np.hypot(by_means[:, 0], by_means[:, 1])
-        self.leads_log_std[region] = np.abs(by_means[:, 2])
+        self.by_means_std = whole.by_means_std.copy()
+        self.by_means_std[region] = np.abs(by_means[:, :3])
 
     def has_left(self) -> bool:
         """Whether the fitted cells have moved too far from g0 for S."""

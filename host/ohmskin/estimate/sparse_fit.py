@@ -228,8 +228,8 @@ class Touched:
     cells: the touched cells, (k,).
     log_cells: log resistances of all cells, (RC,) [log ohm].
     log_cells_std: their deviation, (RC,).
-    wires_log_std: the part of it that comes from the mean wires of the layers, (RC,).
-    leads_log_std: the part of it that comes from the mean lead, (RC,).
+    by_means_std: the parts of it that come from the means of the top and of the bottom layer, and
+        from the mean lead, (RC, 3).
     modelled: port currents of the model, (RC,) [S].
     iterations: steps taken.
     teach: says what the readings tell of the wires. Only some frames are asked.
@@ -240,8 +240,7 @@ class Touched:
     cells: Cells
     log_cells: Float
     log_cells_std: Float
-    wires_log_std: Float
-    leads_log_std: Float
+    by_means_std: Float
     modelled: Float
     iterations: int
     teach: Callable[[], Lesson]
@@ -507,11 +506,10 @@ class FewTouches:
         by_means: how far a mean that is one deviation off moves x, (k, number of means).
         """
         prior, cells = self._skin.prior, self.cells
-        std, of_means = prior.std.copy(), np.zeros((modelled.size, by_means.shape[1]))
+        std, of_means = prior.std.copy(), np.zeros((modelled.size, 3))
         std[cells] = np.sqrt(covariance.diagonal())
-        of_means[cells] = by_means
-        parts = np.hypot(*of_means[:, :2].T), of_means[:, 2]
-        return Touched(cells, self.log_cells, std, *parts, modelled, self.steps, teach)
+        of_means[cells] = by_means[:, :3]
+        return Touched(cells, self.log_cells, std, of_means, modelled, self.steps, teach)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
         """At which ports wires may move the reading by more than `HEAVY_SHARE` of its noise, (RC,).

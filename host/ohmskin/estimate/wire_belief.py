@@ -63,8 +63,9 @@ from ohmskin.estimate.prior import (
     UNKNOWN_LEAD_STD_OHM,
     UNKNOWN_WIRE_OHM,
     UNTOLD_REACH_STDS,
+    USUAL_LAYER_STD,
     USUAL_LEAD_STD_OHM,
-    WireStds,
+    UpperLimits,
 )
 
 # A frame is fitted again if its lesson moves the log of a mean by more. Chosen: 30 %, up to which
@@ -124,13 +125,13 @@ class SkinWires:
 @dataclass(eq=False)
 class _State:
     """What fits take for the wires: m, V, and what follows: its root, the deviations of m, and the
-    wires and how well they are known, once asked for.
+    wires and their upper limits, once asked for.
     """
 
     means: Float
     covariance: Float
     wires: SkinWires | None = None
-    stds: WireStds | None = None
+    limits: UpperLimits | None = None
 
     def __post_init__(self) -> None:
         self.root: Float = np.asarray(np.linalg.cholesky(self.covariance), np.float64)
@@ -183,7 +184,9 @@ class WireBelief(ABC):
         layer_stds = np.maximum(layer_stds, 0.01)
         lead_ohm, lead_std_ohm = wires.lead_or_usual(UNKNOWN_LEAD_STD_OHM)
         lead_std_ohm = max(lead_std_ohm, 1e-3)
-        self._usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
+        usual_layer_stds = layer_stds if wires.both else np.full(2, USUAL_LAYER_STD)
+        usual_lead_std_ohm = min(USUAL_LEAD_STD_OHM, lead_std_ohm)
+        self._usual_stds = np.array([*usual_layer_stds, usual_lead_std_ohm])
         # Where each line's own lead is in m.
         self._of_lines = slice(3, 3 + rows + columns)
         # Where leaks are in m, and what segments differ from their means by: at first, nowhere.
@@ -250,26 +253,29 @@ class WireBelief(ABC):
     def _believe(self, means: Float, covariance: Float) -> None:
         """Take these means (n,), with this covariance (n, n), for what is known.
 
-        A lead that nobody has told may be anything up to kilohms, and lessons must be able to show
-        that. But most skins have a usual lead. Frames that tell nothing of the lead, as those of
-        fingertips do, are answered better if fits expect the usual one. So there are two states:
-        `_known`, and `_usual`, which also has a prior of the usual lead. Where the known lead is
-        far from the usual one, this prior is as wide as they are apart: like that of a cell, it has
-        a heavy tail (`prior.CellPrior`). The deviations of answers always come from what is known.
+        Layers and leads that nobody has told may be anything up to kilohms, and lessons must be
+        able to show that. But most skins have usual ones. Frames that tell nothing of them, as
+        those of fingertips do, are answered better if fits expect the usual ones. So there are two
+        states: `_known`, and `_usual`, which also has a prior of usual layers and leads. Where a
+        known mean is far from the usual one, this prior is as wide as they are apart: like that of
+        a cell, it has a heavy tail (`prior.CellPrior`). The deviations of answers always come from
+        what is known.
         """
         self._known = self._usual = _State(means, covariance)
-        away_ohm = abs(float(means[2] - self._nominal[2]))
-        usual = max(self._usual_lead_std_ohm, away_ohm) ** -2.0 - 1.0 / self._prior_covariance[2, 2]
-        if usual > 0.0:
+        shared = np.arange(3)  # both layers and the lead
+        away = np.abs(means - self._nominal)[shared]
+        known = 1.0 / self._prior_covariance[shared, shared]
+        usual = np.maximum(np.maximum(self._usual_stds, away) ** -2.0 - known, 0.0)
+        if usual.any():
             information = np.linalg.inv(covariance)
             right = information @ means
-            information[2, 2] += usual
-            right[2] += usual * self._nominal[2]
+            information[shared, shared] += usual
+            right[shared] += usual * self._nominal[shared]
             covariance = np.linalg.inv(information)
             self._usual = _State(covariance @ right, covariance)
-        self.expect_usual_leads(True)
+        self.expect_usual(True)
 
-    def expect_usual_leads(self, wanted: bool) -> None:
+    def expect_usual(self, wanted: bool) -> None:
         """Let m and V be what fits expect under fingertips (wanted), or what is known."""
         self._state = self._usual if wanted else self._known
         self.means, self._root = self._state.means, self._state.root
@@ -397,24 +403,26 @@ class WireBelief(ABC):
     @property
     def is_assumed(self) -> bool:
         """Whether nobody has told the layers, and frames have not taught them as well."""
-        return self.untold and float(self.means_std()[:2].max()) >= LAYER_STD
+        return self.untold and float(self._known.means_std[:2].max()) >= LAYER_STD
 
-    def stds(self) -> WireStds:
-        """How well the means are known: made once for each belief."""
-        if self._state.stds is None:
-            layer_stds, lead_std_ohm = self.means_std()[:2], float(self.means_std()[2])
-            wary_stds = np.maximum(self._wary_layer_stds(), layer_stds)
-            self._state.stds = WireStds(
-                float(wary_stds.max()),
-                float((wary_stds / layer_stds).max()),
-                self._known_lead_std_ohm / lead_std_ohm,
-                UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS,
-            )
-        return self._state.stds
+    def upper_limits(self) -> UpperLimits:
+        """How large the means of both layers and of the lead may be: made once for each belief.
+
+        Their upper limits are `REACH_STDS` deviations above them. These are not the deviations that
+        fits take, but those of what is known (`_believe`), and of wires that may just have grown
+        longer. As layers are normal in their log, their limits are further up than to first order.
+        """
+        if self._state.limits is None:
+            known = self._known.means_std[:3]
+            reach = REACH_STDS * known
+            reach[:2] = np.expm1(REACH_STDS * np.maximum(self._wary_layer_stds(), known[:2]))
+            count_as = UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS
+            self._state.limits = UpperLimits(reach / self.means_std()[:3], count_as)
+        return self._state.limits
 
     def _wary_layer_stds(self) -> Float:
         """Deviations of both layers (2,), for wires that may have changed since the last frame."""
-        return self.means_std()[:2]
+        return self._known.means_std[:2]
 
     @property
     def _known_lead_std_ohm(self) -> float:
@@ -487,18 +495,15 @@ class WireBelief(ABC):
         path = by_top * segments[0].cumsum(axis=1) + by_bottom * segments[1].cumsum(axis=0)
         return np.asarray(path.ravel() + self.leads_of_ports @ leads)
 
-    def parts_of_level(
-        self, log_std: Float, wires_log_std: Float, leads_log_std: Float
-    ) -> tuple[Float, Float, Float]:
-        """The deviation of a level, and the parts of it that come from wires and from the lead.
+    def parts_of_level(self, log_std: Float, by_means_std: Float) -> tuple[Float, Float]:
+        """The deviation of a level, and the parts of it that come from the means.
 
         It is that of the cell, without what wires were told wrongly by. Arguments and results are
-        as `prior.siemens_std` takes them, (RC,).
+        as `prior.siemens_std` takes them.
         """
         share = self.told.told_share
-        gone = share * (wires_log_std**2 + leads_log_std**2)
-        own, left = np.sqrt(np.maximum(log_std**2 - gone, 0.0)), (1.0 - share) ** 0.5
-        return own, left * wires_log_std, left * leads_log_std
+        gone = share * (by_means_std**2).sum(axis=1)
+        return np.sqrt(np.maximum(log_std**2 - gone, 0.0)), (1.0 - share) ** 0.5 * by_means_std
 
     def believed_wires(self) -> SkinWires:
         """The wires as believed, for answers whose fit took them so: made once for each belief."""
