@@ -213,21 +213,12 @@ def impedance_of(
 
 def path_of_lines(top_wire_ohm: Wire, bottom_wire_ohm: Wire, shape: tuple[int, int]) -> Float:
     """Wire from each cell to the near end of its row, and of its column [ohm], (RC, R+C)."""
-    if isinstance(top_wire_ohm, float) and isinstance(bottom_wire_ohm, float):
-        segment_ohm = np.repeat([top_wire_ohm, bottom_wire_ohm], shape)
-        return np.asarray(_unit_path(*shape) * segment_ohm)
     rows, columns = shape
-    to_cell = np.zeros((rows, columns, rows + columns))
-    np.einsum("iji->ij", to_cell[..., :rows])[:] = np.cumsum(top_wire_ohm, 1)
-    np.einsum("ijj->ij", to_cell[..., rows:])[:] = np.cumsum(bottom_wire_ohm, 0)
+    to_cell = np.zeros((*shape, rows + columns))
+    top_ohm, bottom_ohm = (np.broadcast_to(ohm, shape) for ohm in (top_wire_ohm, bottom_wire_ohm))
+    np.einsum("iji->ij", to_cell[..., :rows])[:] = np.cumsum(top_ohm, 1)
+    np.einsum("ijj->ij", to_cell[..., rows:])[:] = np.cumsum(bottom_ohm, 0)
     return to_cell.reshape(rows * columns, -1)
-
-
-@lru_cache(maxsize=8)
-def _unit_path(rows: int, columns: int) -> Float:
-    """`path_of_lines` of wires of 1 ohm a segment."""
-    ones = np.ones((rows, columns))
-    return path_of_lines(ones, ones, ones.shape)
 
 
 def leak_admittance(shape: tuple[int, int], leak_siemens: tuple[float, float]) -> Float:
