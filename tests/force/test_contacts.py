@@ -1,19 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contacts: what is one thing, where it is, and that it stays itself while it moves."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ohmskin.force.contacts import MEMORY_US, Contact, ContactTracker
+from ohmskin.force.contacts import MEMORY_US, Contact, ContactTracker, found
 
 SCAN_US = 11_111
+
+
+def of_one_scan(*arrays: NDArray[Any]) -> list[Contact]:
+    """Contacts by which cells are touched, their forces and deviations, (R, C) each."""
+    return found(*(array[None] for array in arrays))[0]
 
 
 def seen(
     tracker: ContactTracker, scan: int, force_n: NDArray[np.float64], std_n: float = 0.1
 ) -> tuple[Contact, ...]:
-    return tracker.update(scan * SCAN_US, force_n > 0, force_n, np.full(force_n.shape, std_n))
+    std = np.full(force_n.shape, std_n)
+    return tracker.follow(scan * SCAN_US, of_one_scan(force_n > 0, force_n, std))
 
 
 def skin(text: str) -> NDArray[np.float64]:
@@ -39,7 +47,7 @@ def test_what_adjoins_is_one_contact() -> None:
 def test_cells_that_share_wires_may_err_alike() -> None:
     """Wires that are taken for too short lower the force of every cell behind them."""
     force_n, std_n = skin("1300 0020"), skin("1200 0040") / 10
-    (contact,) = ContactTracker().update(0, force_n > 0, force_n, std_n)
+    (contact,) = of_one_scan(force_n > 0, force_n, std_n)
     for sign in (1, -1):
         error_n = (force_n + sign * std_n)[force_n > 0].sum() - contact.force_n
         assert abs(error_n) == pytest.approx(contact.force_n_std)
@@ -56,16 +64,14 @@ def test_cells_that_share_wires_may_err_alike() -> None:
     ],
 )
 def test_a_force_is_written_with_its_deviation(force_n: float, std_n: float, text: str) -> None:
-    (contact,) = ContactTracker().update(
-        0, np.array([[True]]), np.array([[force_n]]), np.array([[std_n]])
-    )
+    (contact,) = of_one_scan(*(np.array([[each]]) for each in (True, force_n, std_n)))
     assert contact.force_text == text
 
 
 def test_a_touch_without_force_has_a_centre() -> None:
     touched = np.array([[True, True, False]])
     nothing = np.zeros((1, 3))
-    (contact,) = ContactTracker().update(0, touched, nothing, nothing)
+    (contact,) = of_one_scan(touched, nothing, nothing)
     assert (contact.row, contact.column, contact.force_n) == (0.0, 0.5, 0.0)
 
 

@@ -27,7 +27,7 @@ from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES
 from ohmskin.estimate.knowledge import REF_LOG_STD
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
-from ohmskin.force.contacts import ContactTracker
+from ohmskin.force.contacts import found
 from ohmskin.force.reader import SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
@@ -182,8 +182,8 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
         )
         lines = ["   ".join(contacts) or "no contact"]
         if skin.true_force_n is not None:
-            true_n = skin.true_force_n(scan)
-            truth = ContactTracker().update(0, true_n > KNOWN_N, true_n, np.zeros_like(true_n))
+            true_n = skin.true_force_n(scan)[None]  # of one scan
+            (truth,) = found(true_n > KNOWN_N, true_n, np.zeros_like(true_n))
             of_each = (f"{one.force_n:.2f} N at ({one.row:.1f}, {one.column:.1f})" for one in truth)
             lines.append(f"truth: {'   '.join(of_each) or 'no contact'}")
         caption = "\n".join([*lines, caption])

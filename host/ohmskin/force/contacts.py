@@ -62,7 +62,7 @@ class Contact:
 
 
 class ContactTracker:
-    """Finds the contacts of each scan. A contact that was there before keeps its number.
+    """Numbers the contacts of each scan. One that was there before keeps its number.
 
     Contacts of two scans are matched so that the sum of the distances of their centres is least
     (the assignment problem). A contact is never matched with one that is farther away than
@@ -75,12 +75,6 @@ class ContactTracker:
         self._remembered: dict[int, tuple[Contact, int]] = {}
         self._new_identities = count(1)
         self._before_us = 0  # the time of the scan before
-
-    def update(
-        self, time_us: int, touched: Bool, force_n: Float, force_n_std: Float
-    ) -> tuple[Contact, ...]:
-        """The contacts of a scan, the oldest first. Arrays (R, C); time_us: the board's."""
-        return self.follow(time_us, found(touched[None], force_n[None], force_n_std[None])[0])
 
     def follow(self, time_us: int, contacts: list[Contact]) -> tuple[Contact, ...]:
         """These contacts of a scan with their numbers, the oldest first. time_us: the board's."""
