@@ -7,6 +7,7 @@ import heapq
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from itertools import repeat
 from os import PathLike
 from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 
@@ -63,8 +64,8 @@ class Boards(Closing, dict[int, _Skin], Generic[_Skin, _Scan]):
         """
         # The iterators begin here, all boards at once. The merge would begin each of them only when
         # it first takes a scan of its board.
-        begun = [cast("Iterator[_Scan]", iter(device)) for device in self.values()]
-        of_boards = map(_named, self, begun)
+        begun = [map(BoardScan, repeat(unit), iter(device)) for unit, device in self.items()]
+        of_boards = cast("list[Iterator[BoardScan[_Scan]]]", begun)
         return heapq.merge(*of_boards, key=lambda board_scan: board_scan.scan.time_ns)
 
     def close(self) -> None:
@@ -72,10 +73,6 @@ class Boards(Closing, dict[int, _Skin], Generic[_Skin, _Scan]):
         with ExitStack() as closing:
             for device in self.values():
                 closing.push(device)
-
-
-def _named(unit_id: int, scans: Iterator[_Scan]) -> Iterator[BoardScan[_Scan]]:
-    return (BoardScan(unit_id, scan) for scan in scans)
 
 
 @overload
