@@ -1,18 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a port's URL to a device: the one place that knows the kinds of ports.
 
-==================================  ==========================================================
-``/dev/ttyACM0``, ``COM3``          a serial port; ``?baud=1000000`` for the faster line
-``emulator://8x8?scene=ghost``      an emulated board, in this process (`ohmskin.emulate`);
-                                    ``speed=0``: its time passes as fast as its scans are taken
-``simavr://uno?scene=ghost``        the built firmware, run by an AVR simulator in real time
-``replay://FILE.mcap?speed=1``      a recording (`ohmskin.record.replay`); ``speed=0``: it is played
-                                    as fast as its scans are taken
-``socket://robot:4000``             a serial port of another computer, behind ser2net or socat
-                                    (pyserial opens it); ``rfc2217://`` sets its speed, too
-==================================  ==========================================================
-
-Modules that only one kind of port needs are imported when such a port is opened.
+docs/commands.md lists them. Modules that only one kind of port needs are imported when such a port
+is opened.
 """
 
 from __future__ import annotations

@@ -2,16 +2,7 @@
 """A force sensor at a serial port: a load cell's board, a scale, a force-torque sensor.
 
 A sample's time is that of its arrival here, on the same clock as the scans, so that both can be
-recorded side by side (`recorder.record`). These lines are read (`ForceLineDecoder`):
-
-======================  ============================================================================
-line                    of
-======================  ============================================================================
-``12.3``                sketches for the HX711, the usual converter of load cells
-``1042,12.3``           the same, with the time first
-``ST,GS,+  123.4 g``    scales that print by themselves; so are ``S S 100.00 g``, ``N + 12.3 g``
-``0.1,-0.2,12.3``       force-torque sensors, of which the user names the column
-======================  ============================================================================
+recorded side by side (`recorder.record`). docs/calibrate.md lists the lines that are read.
 """
 
 import math
@@ -69,7 +60,7 @@ _SHOWN_CHARS: Final = 40
 
 
 class ForceLineDecoder:
-    """Forces from what a serial sensor prints: the module lists the lines that it knows.
+    """Forces from what a serial sensor prints; docs/calibrate.md lists the lines that it knows.
 
     newtons_per_unit: the force is so many times what a line says.
     unit: of lines that state none, a key of `NEWTONS`; "": newtons, unless other lines state one.
