@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Methods `lsq` and `regularized`: the paper's Algorithm 1 converges, and to circuits that hold."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -255,7 +253,8 @@ def test_a_current_that_no_port_gives_is_named(
 def test_the_step_in_which_ipopt_gives_up_is_named(
     method: type[PaperEstimator], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(paper, "program_for", partial(Program, max_iterations=1))
+    monkeypatch.setattr(paper, "MAX_ITERATIONS", 1)
+    monkeypatch.setattr(paper, "program_for", Program)  # builds one that is not kept
     found = method(SkinKnowledge(2, 2)).estimate(readings(a_skin(2, 2)))
     assert found.message.startswith(f"step {method.steps[-1].number}: Ipopt ends with Max")
 

@@ -353,8 +353,7 @@ class Program:
     """
 
     @ctrl_c_kept()
-    def __init__(self, rows: int, columns: int, max_iterations: int = MAX_ITERATIONS) -> None:
-        """max_iterations: after so many, Ipopt gives up."""
+    def __init__(self, rows: int, columns: int) -> None:
         cells = rows * columns
         y = casadi.SX.sym("y", READINGS_PER_CELL * cells)
         references = casadi.SX.sym("ref", 2)
@@ -380,7 +379,7 @@ class Program:
             "p": casadi.vertcat(y, references, weights),
         }
         self._solvers = {
-            start: _make_solver(problem, more | {"max_iter": max_iterations})
+            start: _make_solver(problem, more | {"max_iter": MAX_ITERATIONS})
             for start, more in _STARTS.items()
         }
         # Bounds of the variables: resistances have some, potentials none. All laws must be zero.
