@@ -5,7 +5,6 @@ A method derives from `Estimator` and writes `_solve`. Checking the readings, ti
 which cells are touched happen here, so that all methods do them alike.
 """
 
-import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -294,9 +293,6 @@ class Estimator(ABC):
             return float(off.ravel() @ off.ravel()) / off.size
         references = knowledge.ref_top_ohm, knowledge.ref_bottom_ohm
         model = ratio_from_current(current_siemens, *references)
-        residual = (ports.ratio - model).ravel() / knowledge.ratio_std
-        square = float(residual @ residual)
-        if math.isnan(square):
-            residual = residual[~np.isnan(residual)]
-            square = float(residual @ residual)
-        return square / residual.size
+        residual = (ports.ratio - model) / knowledge.ratio_std
+        residual = residual[~np.isnan(residual)]  # of what was read
+        return float(residual @ residual) / residual.size
