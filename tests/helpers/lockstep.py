@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ohmskin.emulate.simavr import SkinSim
+from ohmskin.emulate.simavr import SkinSim, table_of
 from ohmskin.files import Closing
 from ohmskin.link import framing, protocol
 from places import ROOT
@@ -59,6 +59,13 @@ class LockstepSim(SkinSim):
     """By so much a hold may come early or late."""
     adc_bits = protocol.ADC_BITS
     """Bits of its converter."""
+
+    def set_table(self, ratio: NDArray[np.float64]) -> None:
+        """Set these readings: `table_of`. Raises SimulationError for a ratio that is not finite.
+
+        An ideal conversion gives the code min(1023, floor(1024 ratio)).
+        """
+        self.request("T", table_of(ratio))
 
     def run_cycles(self, cycles: int) -> bytes:
         """Run for `cycles` CPU cycles (16 MHz), to the end of the instruction that reaches them.

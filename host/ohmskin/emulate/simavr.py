@@ -106,14 +106,6 @@ class SkinSim(Closing):
             self._process.wait()
         self._stderr.close()
 
-    def set_table(self, ratio: Float) -> None:
-        """Set readings a to h, or a to d alone, (rows, columns, n), of up to 32 rows and columns.
-
-        Cells beyond the array carry no current: 1, 0, 1, 0. An ideal conversion gives the code
-        min(1023, floor(1024 ratio)). Raises SimulationError for a ratio that is not finite.
-        """
-        self.request("T", _table(ratio))
-
     def set(self, **settings: float | str) -> None:
         """Change settings of the simulator: firmware/sim/README.md lists them.
 
@@ -247,7 +239,7 @@ class SimavrLink(SerialLink):
         skin = self._scene.skin(scene_s)
         admittance = end_admittance(skin)
         currents = bytes([_FAR_ENDS + self._scene.rows]) + admittance.tobytes()
-        table = _table(all_readings(skin, admittance))
+        table = table_of(all_readings(skin, admittance))
         *_, stats = self.sim.requests(("C", currents), ("T", table), ("S", b""))
         self._shown_s.append((_simulated_s(stats), scene_s))
 
@@ -273,8 +265,11 @@ class SimavrLink(SerialLink):
                     file.write(content)
 
 
-def _table(ratio: Float) -> bytes:
-    """What the request "T" takes, of readings (rows, columns, n)."""
+def table_of(ratio: Float) -> bytes:
+    """What the request "T" takes: readings a to h, or a to d alone, (rows, columns, n).
+
+    There are up to 32 rows and columns. Cells beyond the array carry no current: 1, 0, 1, 0.
+    """
     rows, columns, readings = ratio.shape
     lines = 16 if max(rows, columns) <= 16 else 32
     table = np.tile([1.0, 0.0], (lines, lines, 4))
