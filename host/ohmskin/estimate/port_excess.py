@@ -28,8 +28,8 @@ changes, these two differ, and cells differ by unlike amounts. Then the frame co
     1 / w = pi / 2 (median |x - median(x)| / 0.6745)^2 / cells + (median |d|)^2 ,
 
 with s_e the deviation of e before any such frame (`EXCESS_STD_RATIO`), and the first square at
-least that of the deviation of rounding. The sums forget as those of `port_mirror` do. Only cells
-with h above 1/2 count, and only frames with enough of them, whose median is within
+least that of the deviation of rounding. Each frame takes a share of 1 / BOARD_FRAMES off both sums.
+Only cells with h above 1/2 count, and only frames with enough of them, whose median is within
 `_MOST_EXCESS_STDS` s_e.
 """
 

@@ -6,10 +6,9 @@ Symbols are those of `port_currents` and `port_noise`; K are the readings of a c
     I = sum_{k in K} s_k R_k (y_k - o_k - b_k) / sum_{k in K} R_k^2 ,
     s_I^2 = v_I / sum R_k^2 .
 
-Fewer than four readings do not show the offset o_k of each node, nor v, nor the bow beta of the
-converter, which four readings cancel. Frames in which all was read show them (`port_mirror`). Of
-several in a row, the last one before a frame of fewer readings is asked: o_k is that of the last
-one asked, v and beta are those of all that were. beta 4 y_k (1 - y_k) counts to b_k.
+Fewer than four readings do not show the offset o_k of each node, nor v. Frames in which all was
+read show them (`port_mirror`). Of several in a row, the last one before a frame of fewer readings
+is asked: o_k is that of the last one asked, v is that of all that were.
 Before there was such a frame, the rest readings stand in for it. They may be a mean of many scans,
 which shows hardly any noise, and then v is too small. Where neither was read, o_k is 0, and of two
 or more readings,
@@ -65,7 +64,7 @@ from ohmskin.circuit.configurations import (
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.port_currents import NearReadings, PortCurrents, row_share
 from ohmskin.estimate.port_excess import Excess
-from ohmskin.estimate.port_mirror import APART_SIGN, BoardShown, MirrorReadings, bow_shape
+from ohmskin.estimate.port_mirror import APART_SIGN, BoardShown, MirrorReadings
 from ohmskin.estimate.port_noise import MEDIAN_CHI2, STAYING_SHARE
 
 # Share of its current by which a port that is not read may change from frame to frame. Chosen: by
@@ -155,7 +154,6 @@ class PartialEnds:
         kinds = ~np.isnan(ratio).all(axis=(0, 1))
         slope = (READING_SIGN * self._reference)[kinds]
         signal = (ratio - READING_OFFSET - board.offset_ratio)[..., kinds]
-        signal = signal - board.bow_ratio * bow_shape(ratio[..., kinds])
         by_each = signal / slope
         # A scan has at least the noise of rounding.
         shown = board.noise or self._last.noise or self._noise(by_each, slope)
