@@ -23,6 +23,7 @@ from ohmskin.estimate.prior import (
     MEMORY,
     SEGMENT_STD,
     STEADY_FADE,
+    UNKNOWN_LAYER_STD,
     USUAL_LAYER_STD,
     WARY_ODDS,
 )
@@ -332,6 +333,24 @@ def test_a_lesson_that_says_nothing_asks_for_no_other_fit() -> None:
     assert not belief.after_fit(SilentFit(), ports)
 
 
+def test_limits_of_untold_wires_count_as_more_deviations_until_frames_teach_them() -> None:
+    belief, taught = LearnedWires((2, 2), WireOhm()), []
+    unknown = belief.upper_limits()
+    np.testing.assert_allclose(unknown.reach[:2], np.expm1(2 * UNKNOWN_LAYER_STD))
+    np.testing.assert_allclose(unknown.stds, unknown.reach / [4, 4, 2])
+    means = np.add(belief.means, [2.5, 0, 0, 0, 0, 0, 0])  # a layer of 1.8 kOhm
+    for log_std in (0.45, 0.31, 0.29):
+        belief._believe(means, np.diag([log_std, log_std, 200.0, 0.1, 0.1, 0.1, 0.1]) ** 2)
+        taught.append(belief.upper_limits().reach[0] / belief.upper_limits().stds[0])
+        assert belief.is_assumed == (log_std > 0.3)
+        # The prior of usual layers has a heavy tail, so that it hardly pulls at what is known.
+        assert abs(belief.means[0] - means[0]) < 0.1
+    np.testing.assert_allclose(taught, [3, 0.62 / 0.3, 2])
+    told = LearnedWires((2, 2), WireOhm(100.0, 200.0, 0.0, 1.0, 1.0))
+    np.testing.assert_allclose(told.upper_limits().reach / told.upper_limits().stds, 2)
+    assert told.means_std()[0] == pytest.approx(np.hypot(1.0, LAYER_STD))  # no usual ones
+
+
 def learned(by_mean: Float, noise: Float, at: Float, faded: Float) -> tuple[float, Float, Float]:
     """Likelihood of a residual, what the mean gains, and its covariance after it (Kalman)."""
     expected = by_mean @ faded @ by_mean.T + noise
@@ -408,8 +427,10 @@ def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one(segments: int)
         )
     wary_std = np.hypot(np.sqrt(np.diag(wary)), wary_mean - mean)[:2]
     layer_std = np.sqrt(np.diag(covariance))[:2]
-    limits = [*np.expm1(2 * np.maximum(wary_std, layer_std)), 2 * covariance[2, 2] ** 0.5]
-    np.testing.assert_allclose(belief.upper_limits().stds, limits / belief.means_std()[:3])
+    reach = [*np.expm1(2 * np.maximum(wary_std, layer_std)), 2 * covariance[2, 2] ** 0.5]
+    for usual in (True, False):
+        belief.expect_usual(usual)
+        np.testing.assert_allclose(belief.upper_limits().reach, reach)
     np.testing.assert_allclose(belief.means_std(), np.sqrt(covariance.diagonal()))
     np.testing.assert_allclose(belief.expected_wires, wires_of(mean), rtol=1e-9)
     # How wires follow the means: by differences.

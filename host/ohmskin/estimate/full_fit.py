@@ -57,7 +57,7 @@ from ohmskin.estimate.prior import (
     UNLIMITED_STD,
     CellPrior,
 )
-from ohmskin.estimate.wire_belief import Lesson, WireBelief
+from ohmskin.estimate.wire_belief import Lesson, WireBelief, without_means
 
 # Most fits take fewer steps. Later ones are shortened where they go back and forth (`_damped`).
 USUAL_ITERATIONS: Final = 12
@@ -87,8 +87,9 @@ class FullFit:
 
     log_cells: log resistances of the cells, (RC,) [log ohm].
     log_cells_std: their posterior deviation, (RC,).
-    by_means_std: the parts of it that come from the means of the top and of the bottom layer, and
-        from the mean lead, (RC, 3).
+    own_log_std: the part of it that does not come from the means of the layers and leads, (RC,).
+    by_means: how much these logs follow the means of the top and of the bottom layer [log ohm], and
+        the mean lead [ohm], up or down, (RC, 3).
     means: those of the wires (`wire_belief`), (n,).
     wires: logs of the segments, then the leads [ohm], (2RC + R+C,).
     iterations: steps taken.
@@ -339,8 +340,10 @@ class FullFit:
             learned = wider**2 * learned
             with_means *= wider[:, None]
             cell_std = wider * cell_std
-        self.by_means_std: Float = cell_std[:, None] * np.abs(with_means)
         self.log_cells_std: Float = cell_std * np.sqrt(np.maximum(1.0 - learned, 1e-12))
+        by_means_std = cell_std[:, None] * with_means
+        parts = without_means(self.log_cells_std, by_means_std, self._belief)
+        self.own_log_std, self.by_means = parts
 
     def _find_unnoticed(self, learned: Float) -> tuple[NDArray[np.bool_], Float]:
         """Which cells may be touched although the prior holds them at rest; and c', both (RC,).

@@ -318,8 +318,13 @@ class JointEstimator(Estimator):
         if isinstance(fit, FullFit):
             wires = belief.wires(fit.wires, fit.means)
         series_ohm = wires.path_ohm + self.knowledge.ref_ohm
-        parts, limits = (fit.log_cells_std, fit.by_means_std), belief.upper_limits()
-        std, std_down = siemens_std(-fit.log_cells, *parts, limits, series_ohm)
+        means_std, upper = belief.means_std()[:3], belief.upper_limits()
+
+        def stds(by_means: Float) -> tuple[Float, Float]:
+            parts = fit.own_log_std, by_means, means_std
+            return siemens_std(-fit.log_cells, *parts, upper, series_ohm)
+
+        std, std_down = stds(fit.by_means)
         # Where the model misses the readings by more than their noise, or by more than it expects
         # to, it is wrong somewhere. So all variances are widened by the ratio.
         wider = max(1.0, fit.misfit, fit.surprise) ** 0.5
@@ -331,9 +336,8 @@ class JointEstimator(Estimator):
             self._hidden_ohm = wires.hidden_path_ohm
         level = in_series(cell_ohm, self._hidden_ohm)
         level_std = std
-        if belief.told.told_share:
-            parts = belief.parts_of_level(*parts)
-            level_std, _ = siemens_std(-fit.log_cells, *parts, limits, series_ohm)
+        if told_share := belief.told.told_share:  # of the means, this share is in curves of presses
+            level_std, _ = stds((1.0 - told_share) ** 0.5 * fit.by_means)
         level_std = level_std * (level * cell_ohm) ** 2  # cell and level have the same error in ohm
         return Solution(
             cell_siemens=(1.0 / cell_ohm).reshape(self._shape),
@@ -499,8 +503,9 @@ class JointEstimator(Estimator):
                 fit = self._expect_leaks(ports, fit)
         log_cells = fit.log_cells
         self._rest_means = means = self._belief.means
+        by_layers_std = fit.by_means[:, :2] * self._belief.means_std()[:2]
+        self._rest_wires_log_std = float(np.hypot(*by_layers_std.T).max())
         self._belief.fix_rest_wires()
-        self._rest_wires_log_std = float(np.hypot(*fit.by_means_std[:, :2].T).max())
         # Where wires hide even cells at rest, cells depend on the wires too strongly for slopes.
         by_means = np.zeros((log_cells.size, len(means)))
         if not self._hides_rest:

@@ -30,8 +30,8 @@ A skin bends. So there are two filters. The steady one is for a skin that lies s
 before a lesson, a small share of what it knows of the layers and of single segments fades, so that
 it follows a slow drift. The wary one takes each lesson twice: for wires that are what they were,
 and, with the odds `CHANGED_ODDS`, for wires that have changed since the last lesson, so that no
-more is known of the layers than that they are usual (of a skin that may not be bent: than was
-told). It goes on with the mixture of both, by its mean and its covariance. (Such a filter is called
+more is known of the layers than a factor of two (of a skin that may not be bent: than was told).
+It goes on with the mixture of both, by its mean and its covariance. (Such a filter is called
 generalized pseudo-Bayesian, of first order: Bar-Shalom, Li, Kirubarajan, *Estimation with
 Applications to Tracking and Navigation*, chapter 11.)
 
@@ -195,9 +195,10 @@ class LearnedWires(WireBelief):
 
     def _changed(self, before: _Filter) -> Float:
         """The same, if they have changed altogether."""
-        if self._may_be_bent:
-            return self._widened(before, np.full(2, USUAL_LAYER_STD**2))
-        return self._widened(before, np.diagonal(self._prior_covariance)[:2])
+        layers = np.full(2, USUAL_LAYER_STD**2)
+        if not self._may_be_bent:
+            layers = np.minimum(layers, np.diagonal(self._prior_covariance)[:2])
+        return self._widened(before, layers)
 
     def _widened(self, before: _Filter, layers: Float) -> Float:
         """V (n, n), if of the layers no more is known than these variances (2,)."""

@@ -54,7 +54,7 @@ UNKNOWN_WIRE_OHM: Final = 150.0
 # Deviation that all segments share, of a layer whose nominal value nobody has told: wires of 10 ohm
 # to some kilohms are not unlikely.
 UNKNOWN_LAYER_STD: Final = 1.5
-# The same, if layers are usual ones, or have changed because the skin was bent: a factor of two.
+# The same for usual layers: a factor of two. A bend changes layers by no more.
 USUAL_LAYER_STD: Final = 0.7
 # Deviation that all segments share, of a layer whose nominal value is told: stretch, temperature.
 LAYER_STD: Final = 0.3
@@ -95,11 +95,11 @@ MAX_STEP_LOG: Final = 1.5
 # Where errors are skewed, the limit of so many deviations is computed. The deviation that is stated
 # is the distance to this limit, divided by so many.
 REACH_STDS: Final = 2.0
-# While nobody has told the wires and no frame has taught them, their upper limits count as so many
+# Where nobody has told the wires and no frame has taught them, their upper limits count as so many
 # deviations away. Chosen: few skins have wires near these limits.
 UNTOLD_REACH_STDS: Final = 4.0
-# Where wires are longer than the fit has them, a cell has lost at most this share of its resistance
-# to them. Chosen: all of it, and what slopes err by.
+# Where wires are longer than the fit has them, they take at most this share of a cell's resistance.
+# Chosen: all of it, and what slopes err by.
 MOST_LOST_SHARE: Final = 1.05
 
 
@@ -244,61 +244,68 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
 
 
 class UpperLimits(NamedTuple):
-    """How large the means of both layers and of the leads may be.
+    """How large the means of both layers and of the lead may be.
 
-    stds: how far above each mean its upper limit is, in the deviations that fits take, (3,).
-    count_as: as how many deviations this counts.
+    reach: how far above each mean its upper limit is: of layers in shares of it, of the lead in
+        ohms, (3,).
+    stds: what of this is stated as one deviation, (3,).
     """
 
+    reach: Float
     stds: Float
-    count_as: float = REACH_STDS
 
 
 def siemens_std(
     log_siemens: Float,
-    log_std: Float,
-    by_means_std: Float,
+    own_std: Float,
+    by_means: Float,
+    means_std: Float,
     upper: UpperLimits,
     series_ohm: Float,
 ) -> tuple[Float, Float]:
     """Standard deviations of conductances, upwards and downwards [S], both (RC,).
 
     log_siemens: logs of the conductances, (RC,) [log S].
-    log_std: deviation of the log conductance, to first order, (RC,).
-    by_means_std: the parts of it that come from the means of both layers and of the leads, (RC, 3).
-    upper: of these means.
+    own_std: deviation of the log conductance without what comes from the means, (RC,).
+    by_means: how much it follows the means of both layers and the mean lead, up or down, (RC, 3).
+    means_std: deviations of the means that the fit took, (3,).
+    upper: of the means.
     series_ohm: leads and wires to the cell, and references, (RC,) [ohm].
 
     The error of the port current I = 1 / (r + series) is normal, and that of g = 1 / r is not. So
     the limits of `REACH_STDS` deviations are found for I, and carried over to g. The deviation is
     the distance to the limit, divided by so many.
 
-    Upwards, the means have a limit of their own: wires and leads at their upper limits take
-    resistance from the cell. The limits are far away where nobody has told the wires. But no cell
-    has less than no resistance. So the cells that lose most to a mean say how large it is at most:
-    the means may use up all of what such a cell has, whichever of the three they are. Both
-    deviations are added as variances. A cell conducts at most as much as the hardest touch.
+    Upwards, what comes from the means is added for itself, as a variance: at their upper limits,
+    wires and leads take resistance from the cells. The limits are far away where nobody has told
+    the wires. But from no cell can they take more than all. So for each mean, the cell that loses
+    most to it is looked at: what this cell can lose bounds what the others lose. A cell conducts at
+    most as much as the hardest touch.
     """
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
     # d log I = - r / (r + series) d log r. So at the limits the current is (1 +- off) I, and the
     # whole resistance is (r + series) / (1 +- off). The cell's is this less `series_ohm`.
     reach_per_std = REACH_STDS * cell_ohm / (cell_ohm + series_ohm)
-    own_std = np.sqrt(np.maximum(log_std**2 - (by_means_std**2).sum(axis=1), 0.0))
+    log_std = np.hypot(own_std, np.linalg.norm(by_means * means_std, axis=1))
     off_up, off_down = reach_per_std * own_std, np.minimum(reach_per_std * log_std, 1.0 - 1e-6)
     own_ohm = (cell_ohm + series_ohm) * off_up / (1.0 + off_up)
     highest_ohm = (cell_ohm + off_down * series_ohm) / (1.0 - off_down)
-    # By how many deviations means may rise, as the cells say that lose most to one: (cell, mean).
-    most_stds = (MOST_LOST_SHARE + REACH_STDS * own_std)[:, None] / np.maximum(by_means_std, 1e-12)
-    most_stds = most_stds[most_stds.argmin(axis=0)]
-    most_share = (by_means_std[:, None] * most_stds).max(axis=2).min(axis=1)
-    share = np.minimum(np.linalg.norm(by_means_std * upper.stds, axis=1), most_share)
+    # How far each cell lets each mean rise alone. Of the three cells that bound the means, each
+    # bounds what all of them take together as well.
+    most = (MOST_LOST_SHARE + REACH_STDS * own_std)[:, None] / np.maximum(by_means, 1e-12)
+    bounds = most.argmin(axis=0)
+    reach = np.minimum(upper.reach, most[bounds, range(3)])
+    together = (by_means[:, None] * most[bounds]).max(axis=2).min(axis=1)
+    share = np.minimum(np.linalg.norm(by_means * reach, axis=1), together)
+    # As how many deviations the limits count.
+    stated = np.maximum(np.linalg.norm(by_means * upper.stds, axis=1), 1e-30)
+    count = np.maximum(np.linalg.norm(by_means * upper.reach, axis=1) / stated, REACH_STDS)
 
-    def risen_siemens(less_ohm: Float) -> Float:
+    def rise_siemens(less_ohm: Float) -> Float:
         return 1.0 / np.maximum(cell_ohm - less_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS) - siemens
 
-    up_own = risen_siemens(own_ohm) / REACH_STDS
-    up_means = risen_siemens(cell_ohm * share) / upper.count_as
+    up_own, up_means = rise_siemens(own_ohm) / REACH_STDS, rise_siemens(cell_ohm * share) / count
     # A cell may conduct nearly as much as the hardest touch, or more. Then the distance to the
     # limit is too small, or below 0. So no less than the deviation to first order is stated.
     up = np.maximum(siemens * log_std, np.hypot(up_own, up_means))

@@ -27,7 +27,7 @@ from ohmskin.estimate.port_partial import STALE_SHARE
 from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import LEFT_OUT_STDS, MAX_CHI2, MAX_STEP_LOG, CellPrior
 from ohmskin.estimate.sparse_fit import NO_CELLS, Cells, RestNetwork, Touched, TouchedNetwork
-from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, WireBelief
+from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, WireBelief, without_means
 
 # Most steps of a frame; one that needs more is fitted as a whole. Chosen: a frame begins at the
 # frame before, and after a hard touch most steps are as long as `MAX_STEP_LOG` lets them.
@@ -46,7 +46,7 @@ class WholeFrame:
         self.log_cells, self.log_cells_std = answer.log_cells, answer.log_cells_std
         if isinstance(answer, RegionFit):
             self.log_cells_std = answer.fitted_std
-        self.by_means_std = answer.by_means_std
+        self.own_log_std, self.by_means = answer.own_log_std, answer.by_means
         self.misfit, self.surprise = answer.misfit, answer.surprise
         self.series_ohm = ref_ohm + belief.leads_of_ports @ belief.lead_ohm(belief.means)
         self.net = belief.circuit(answer.log_cells, belief.means, RestNetwork)
@@ -57,8 +57,7 @@ class RegionFit:
     """Fits frames of one region, one after the other.
 
     log_cells, log_cells_std: of all cells, those outside as in the whole frame, (RC,).
-    by_means_std: the parts of log_cells_std that come from the means of the top and of the bottom
-        layer, and from the mean lead, (RC, 3).
+    own_log_std, by_means: as those of a `FullFit`.
     modelled: port currents of the model, (RC,) [S]; outside of the region, those that are kept.
     iterations: steps of the last frame.
     misfit, surprise: of the whole frame, because a frame that does not fit gets no answer here.
@@ -68,7 +67,8 @@ class RegionFit:
 
     log_cells: Float
     log_cells_std: Float
-    by_means_std: Float
+    own_log_std: Float
+    by_means: Float
     fitted_std: Float
     misfit: float
     surprise: float
@@ -148,8 +148,10 @@ class RegionFit:
         # A cell outside changes by the same share as the current of a port that is not read.
         self.log_cells_std = np.hypot(self.fitted_std, STALE_SHARE * self.age)
         self.log_cells_std[region] = self.fitted_std[region]
-        self.by_means_std = whole.by_means_std.copy()
-        self.by_means_std[region] = np.abs(by_means[:, :3])
+        self.own_log_std = np.hypot(whole.own_log_std, STALE_SHARE * self.age)
+        self.by_means = whole.by_means.copy()
+        of_region = without_means(self.fitted_std[region], by_means[:, :3], whole.belief)
+        self.own_log_std[region], self.by_means[region] = of_region
 
     def has_left(self) -> bool:
         """Whether the fitted cells have moved too far from g0 for S."""

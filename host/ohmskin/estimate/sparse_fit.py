@@ -67,7 +67,7 @@ from ohmskin.estimate.prior import (
     UNLIMITED_STD,
     CellPrior,
 )
-from ohmskin.estimate.wire_belief import Lesson, WireBelief
+from ohmskin.estimate.wire_belief import Lesson, WireBelief, without_means
 
 Cells = NDArray[np.intp]
 NO_CELLS: Final[Cells] = np.zeros(0, dtype=np.intp)
@@ -228,8 +228,9 @@ class Touched:
     cells: the touched cells, (k,).
     log_cells: log resistances of all cells, (RC,) [log ohm].
     log_cells_std: their deviation, (RC,).
-    by_means_std: the parts of it that come from the means of the top and of the bottom layer, and
-        from the mean lead, (RC, 3).
+    own_log_std: the part of it that does not come from the means of the layers and leads, (RC,).
+    by_means: how much these logs follow the means of the top and of the bottom layer [log ohm], and
+        the mean lead [ohm], up or down, (RC, 3).
     modelled: port currents of the model, (RC,) [S].
     iterations: steps taken.
     teach: says what the readings tell of the wires. Only some frames are asked.
@@ -240,7 +241,8 @@ class Touched:
     cells: Cells
     log_cells: Float
     log_cells_std: Float
-    by_means_std: Float
+    own_log_std: Float
+    by_means: Float
     modelled: Float
     iterations: int
     teach: Callable[[], Lesson]
@@ -509,7 +511,8 @@ class FewTouches:
         std, of_means = prior.std.copy(), np.zeros((modelled.size, 3))
         std[cells] = np.sqrt(covariance.diagonal())
         of_means[cells] = by_means[:, :3]
-        return Touched(cells, self.log_cells, std, of_means, modelled, self.steps, teach)
+        parts = without_means(std, of_means, self._skin.belief)
+        return Touched(cells, self.log_cells, std, *parts, modelled, self.steps, teach)
 
     def _moved_by_wires(self) -> NDArray[np.bool_]:
         """At which ports wires may move the reading by more than `HEAVY_SHARE` of its noise, (RC,).

@@ -93,6 +93,16 @@ class Lesson(NamedTuple):
     factor: Float
 
 
+def without_means(log_std: Float, by_means_std: Float, belief: "WireBelief") -> tuple[Float, Float]:
+    """Two attributes of a fit, `own_log_std` (k,) and `by_means` (k, 3), of k cells.
+
+    log_std: deviation of the log resistance, (k,). by_means_std: the parts of it that come from the
+    means of both layers and the mean lead, as the fit took them from this belief, (k, 3).
+    """
+    own = np.sqrt(np.maximum(log_std**2 - (by_means_std**2).sum(axis=1), 0.0))
+    return own, np.abs(by_means_std) / belief.means_std()[:3]
+
+
 class Fit(Protocol):
     """What wires learn from: the fit of one frame."""
 
@@ -258,7 +268,7 @@ class WireBelief(ABC):
         those of fingertips do, are answered better if fits expect the usual ones. So there are two
         states: `_known`, and `_usual`, which also has a prior of usual layers and leads. Where a
         known mean is far from the usual one, this prior is as wide as they are apart: like that of
-        a cell, it has a heavy tail (`prior.CellPrior`). The deviations of answers always come from
+        a cell, it has a heavy tail (`prior.CellPrior`). Upper deviations of conductances come from
         what is known.
         """
         self._known = self._usual = _State(means, covariance)
@@ -276,7 +286,7 @@ class WireBelief(ABC):
         self.expect_usual(True)
 
     def expect_usual(self, wanted: bool) -> None:
-        """Let m and V be what fits expect under fingertips (wanted), or what is known."""
+        """Let m and V be the usual ones, for a frame that may tell nothing, or what is known."""
         self._state = self._usual if wanted else self._known
         self.means, self._root = self._state.means, self._state.root
 
@@ -402,23 +412,26 @@ class WireBelief(ABC):
 
     @property
     def is_assumed(self) -> bool:
-        """Whether nobody has told the layers, and frames have not taught them as well."""
+        """Whether nobody has told the layers, nor frames taught both of them to `LAYER_STD`."""
         return self.untold and float(self._known.means_std[:2].max()) >= LAYER_STD
 
     def upper_limits(self) -> UpperLimits:
         """How large the means of both layers and of the lead may be: made once for each belief.
 
-        Their upper limits are `REACH_STDS` deviations above them. These are not the deviations that
-        fits take, but those of what is known (`_believe`), and of wires that may just have grown
-        longer. As layers are normal in their log, their limits are further up than to first order.
+        Their upper limits are `REACH_STDS` deviations above them: not those that fits take, but
+        those of what is known (`_believe`), and of wires that may just have grown longer. As layers
+        are normal in their log, their limits are further up than to first order. While nobody has
+        told the layers, their limits count as more deviations, the less frames have taught of them.
         """
-        if self._state.limits is None:
+        if self._known.limits is None:
             known = self._known.means_std[:3]
-            reach = REACH_STDS * known
+            reach, count = REACH_STDS * known, np.full(3, REACH_STDS)
             reach[:2] = np.expm1(REACH_STDS * np.maximum(self._wary_layer_stds(), known[:2]))
-            count_as = UNTOLD_REACH_STDS if self.is_assumed else REACH_STDS
-            self._state.limits = UpperLimits(reach / self.means_std()[:3], count_as)
-        return self._state.limits
+            if self.untold:
+                taught = REACH_STDS * known[:2] / LAYER_STD
+                count[:2] = np.clip(taught, REACH_STDS, UNTOLD_REACH_STDS)
+            self._known.limits = UpperLimits(reach, reach / count)
+        return self._known.limits
 
     def _wary_layer_stds(self) -> Float:
         """Deviations of both layers (2,), for wires that may have changed since the last frame."""
@@ -494,16 +507,6 @@ class WireBelief(ABC):
         by_top, by_bottom = (0.0 if is_far else 1.0 for is_far in self.far)
         path = by_top * segments[0].cumsum(axis=1) + by_bottom * segments[1].cumsum(axis=0)
         return np.asarray(path.ravel() + self.leads_of_ports @ leads)
-
-    def parts_of_level(self, log_std: Float, by_means_std: Float) -> tuple[Float, Float]:
-        """The deviation of a level, and the parts of it that come from the means.
-
-        It is that of the cell, without what wires were told wrongly by. Arguments and results are
-        as `prior.siemens_std` takes them.
-        """
-        share = self.told.told_share
-        gone = share * (by_means_std**2).sum(axis=1)
-        return np.sqrt(np.maximum(log_std**2 - gone, 0.0)), (1.0 - share) ** 0.5 * by_means_std
 
     def believed_wires(self) -> SkinWires:
         """The wires as believed, for answers whose fit took them so: made once for each belief."""
