@@ -303,6 +303,20 @@ def test_cells_outside_a_region_keep_all_of_their_uncertainty() -> None:
     assert part.cell_siemens_std[6, 6] >= whole.cell_siemens_std[6, 6]
 
 
+def test_wires_that_nobody_told_make_cells_outside_a_region_no_more_uncertain() -> None:
+    """The whole frame has taught something of the wires, which counts for these cells as well."""
+    trial = random_trial(8, 8, 2, 8, seed=2)
+    given = trial.rounded(10, wires_told=False)
+    for ratio, pressed in zip(given.ratio, trial.pressed, strict=True):
+        estimator = make_estimator("joint", given.knowledge(0))
+        whole = estimator.estimate(ratio).cell_siemens_std[pressed]
+        part = ratio.copy()
+        part[pressed.any(axis=1)] = np.nan
+        outside = estimator.estimate(part).cell_siemens_std[pressed]
+        assert (0.2 * whole < outside).all()
+        assert (outside < 1.2 * whole).all()
+
+
 def charged(ratio: Float, random: np.random.Generator) -> Float:
     """Readings (F, R, C, 4) with lines that charge: a little at each cell, by 2 LSB on average.
 
