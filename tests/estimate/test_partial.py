@@ -284,6 +284,7 @@ def test_cells_outside_a_region_age_however_touches_in_it_change(
         found = estimator.estimate(part)
     outside = (found.cell_siemens_std / found.cell_siemens)[6:, :3]
     assert (outside > 0.9 * 12 * STALE_SHARE).all()
+    assert (outside < 1.1 * 12 * STALE_SHARE).all()
 
 
 def test_what_a_whole_frame_cannot_be_relied_on_for_no_region_is() -> None:

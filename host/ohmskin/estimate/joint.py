@@ -292,7 +292,7 @@ class JointEstimator(Estimator):
         explains = self._region.fit(ports)
         if explains and self._region.has_left():
             self._whole = self._as_whole(prior, self._region)
-            self._region = RegionFit(self._whole, ports.region, self._region.age)
+            self._region = RegionFit(self._whole, ports.region, self._region.age - 1)
             explains = self._region.fit(ports)
         return self._region if explains else None
 

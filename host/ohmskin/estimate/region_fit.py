@@ -44,9 +44,9 @@ class WholeFrame:
         is_soft = about.is_soft(answer.log_cells, belief.shape)
         self.prior, self.belief = about.for_soft_touches() if is_soft else about, belief
         self.log_cells, self.log_cells_std = answer.log_cells, answer.log_cells_std
-        if isinstance(answer, RegionFit):
-            self.log_cells_std = answer.fitted_std
         self.own_log_std, self.by_means = answer.own_log_std, answer.by_means
+        if isinstance(answer, RegionFit):
+            self.log_cells_std, self.own_log_std = answer.fitted_std, answer.fitted_own_std
         self.misfit, self.surprise = answer.misfit, answer.surprise
         self.series_ohm = ref_ohm + belief.leads_of_ports @ belief.lead_ohm(belief.means)
         self.net = belief.circuit(answer.log_cells, belief.means, RestNetwork)
@@ -62,7 +62,8 @@ class RegionFit:
     iterations: steps of the last frame.
     misfit, surprise: of the whole frame, because a frame that does not fit gets no answer here.
     age: for how many frames the cells outside have not been read.
-    fitted_std: log_cells_std without what cells outside may have changed by since, (RC,).
+    fitted_std, fitted_own_std: log_cells_std and own_log_std without what cells outside may have
+        changed by since, (RC,).
     """
 
     log_cells: Float
@@ -70,6 +71,7 @@ class RegionFit:
     own_log_std: Float
     by_means: Float
     fitted_std: Float
+    fitted_own_std: Float
     misfit: float
     surprise: float
 
@@ -148,10 +150,11 @@ class RegionFit:
         # A cell outside changes by the same share as the current of a port that is not read.
         self.log_cells_std = np.hypot(self.fitted_std, STALE_SHARE * self.age)
         self.log_cells_std[region] = self.fitted_std[region]
-        self.own_log_std = np.hypot(whole.own_log_std, STALE_SHARE * self.age)
-        self.by_means = whole.by_means.copy()
+        self.fitted_own_std, self.by_means = whole.own_log_std.copy(), whole.by_means.copy()
         of_region = without_means(self.fitted_std[region], by_means[:, :3], whole.belief)
-        self.own_log_std[region], self.by_means[region] = of_region
+        self.fitted_own_std[region], self.by_means[region] = of_region
+        self.own_log_std = np.hypot(self.fitted_own_std, STALE_SHARE * self.age)
+        self.own_log_std[region] = self.fitted_own_std[region]
 
     def has_left(self) -> bool:
         """Whether the fitted cells have moved too far from g0 for S."""
