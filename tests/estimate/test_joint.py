@@ -26,6 +26,7 @@ from ohmskin.estimate.prior import (
     CellPrior,
 )
 from ohmskin.link.codes import quantise, ratio_from_codes
+from pressed_skin import codes_of
 from skins import reference, ten_bits, told
 from studies.trials import (
     finger_trial,
@@ -288,6 +289,17 @@ def test_the_deviation_covers_wires_of_1_kohm_that_nobody_told() -> None:
     is_off = off > np.maximum(0.5 * trial.cell_siemens[::4], 1e-5)
     assert is_off.any()
     assert (off < 4 * std)[is_off].all()
+
+
+def test_a_cell_at_rest_beside_fingertips_on_16x16_is_not_called_open() -> None:
+    """By a node Laplacian. Half of these frames were doubted: cells there are hardly known."""
+    trial = finger_trial(16, 16, 20, 9001)
+    circuit, random = SkinCircuit(trial.rest), np.random.default_rng(1)
+    codes = codes_of(circuit, np.repeat(trial.rest.cell_siemens[None], 60, axis=0), "near", random)
+    rest = ratio_from_codes(codes).mean(axis=0)
+    frames = ratio_from_codes(codes_of(circuit, trial.cell_siemens, "near", random))
+    estimator = make_estimator("joint", SkinKnowledge(16, 16, adc_bits=10, rest_ratio=rest))
+    assert {estimator.estimate(frame).message for frame in frames} == {""}
 
 
 def test_a_firm_palm_is_read_by_the_prior_that_knows_cells_at_rest() -> None:

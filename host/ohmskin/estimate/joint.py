@@ -61,6 +61,9 @@ REST_FITS: Final = 3
 # A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
 
+# And the frame must show it: by more deviations of the cell after the fit. Chosen: beside two
+# fingertips on 16x16, cells at rest seem to conduct less by up to 1.4.
+SHOWN_STDS: Final = 2.0
 # Fits expect leaks if these explain so much of how cells differ at rest: it is the gain in twice
 # the log likelihood. Chosen: few sound skins gain as much by chance, and it costs them some time
 # and next to no accuracy. Leaks of 10 MOhm gain more, and neglected they spoil most frames.
@@ -366,7 +369,10 @@ class JointEstimator(Estimator):
         short = worst_cell(gain, "conducts more than any touch, is it a short?")
         if short or self.knowledge.rest_ratio is None:
             return short
-        loss = fit.log_cells - prior.expected - LOSS_STDS * prior.std
+        # Beside fingertips on a large skin, readings say little of a cell at rest: it may seem to
+        # conduct half as much.
+        limit = np.maximum(LOSS_STDS * prior.std, SHOWN_STDS * fit.log_cells_std)
+        loss = fit.log_cells - prior.expected - limit
         return worst_cell(loss.reshape(self._shape), LOSS_TEXT)
 
     @property
