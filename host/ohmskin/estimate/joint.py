@@ -246,10 +246,7 @@ class JointEstimator(Estimator):
             # knows better which cells are at rest.
             fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, fit.log_cells)
         self._touches = prior.touches(fit.log_cells)
-        # Soft fingertips, and a palm that was fitted again, are doubted by the wide prior. By the
-        # narrow one, cells at the edge of a palm would seem to conduct less than at rest.
-        is_wide = is_soft or spread_share > PALM_SHARE
-        message = self._doubt(fit_prior if is_wide else prior, fit)
+        message = self._doubt(prior, fit)
         # A palm tells of no fault: that so many cells are pressed is a surprise by itself.
         silent = ports.fault or again or spread_share > TELLING_SHARE
         if not silent and ports.current.size >= LEAST_STAYING_PORTS:
