@@ -61,9 +61,9 @@ REST_FITS: Final = 3
 # A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
 
-# And the frame must show it: by more deviations of the cell after the fit. Chosen: beside two
-# fingertips on 16x16, cells at rest seem to conduct less by up to 1.4.
-SHOWN_STDS: Final = 2.0
+# And the frame must show it: by more deviations of the cell after the fit. Chosen: beside
+# fingertips on 16x16, cells at rest seem to conduct less by up to 2.5, once in 250 frames.
+SHOWN_STDS: Final = 3.0
 # Fits expect leaks if these explain so much of how cells differ at rest: it is the gain in twice
 # the log likelihood. Chosen: few sound skins gain as much by chance, and it costs them some time
 # and next to no accuracy. Leaks of 10 MOhm gain more, and neglected they spoil most frames.
@@ -252,7 +252,7 @@ class JointEstimator(Estimator):
         if not silent and ports.current.size >= LEAST_STAYING_PORTS:
             self._staying.count(fit, is_doubted=bool(message))
             if not self._hides_rest:
-                self._staying.compare(fit)
+                self._staying.compare(fit, prior.expected - fit.log_cells)
         if not ports.fault:
             message = self._staying.named or message or self._staying.unnamed
         solution = self._solution(ports, fit, message)  # now: a lesson moves the belief

@@ -31,13 +31,15 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.full_fit import FullFit
-from ohmskin.estimate.prior import MAX_STEP_LOG
 
 # Resistance of a short [ohm]. Chosen: of two threads that touch. Most shorts of up to some hundred
 # ohm look about the same.
 SHORT_OHM: Final = 20.0
 # What one touch adds to a sum, or takes from it, at the most. Chosen: five touches have to agree.
 MOST_GAIN: Final = 8.0
+# Two frames show the same touch if the angle between the rises of their cells has a larger cosine.
+# Chosen: a fingertip has to move by about its width.
+ALIKE: Final = 0.85
 # A sum from here on is a damage. Chosen: of 168 simulated sound boards, and 160 skins of up to 300
 # touches with wires of 10 to 30 % scatter, the largest was 23.
 CERTAIN_GAIN: Final = 40.0
@@ -66,19 +68,24 @@ class StayingFaults:
         self._pairs = np.concatenate([np.arange(rows - 1), np.arange(rows, rows + columns - 1)])
         self._surprise = 0.0
         self._shorts, self._yarns = np.zeros(len(self._pairs)), np.zeros(sum(self._shape))
-        self._log_cells: Float | None = None
+        # How cells rose in the last touch that was asked, to a length of 1, (RC,).
+        self._touch = np.zeros(rows * columns)
 
     def count(self, fit: FullFit, *, is_doubted: bool) -> None:
         """Count how much this frame surprises the model. is_doubted: its fit is no answer."""
         surprise = MOST_SURPRISE if is_doubted else min(fit.surprise, MOST_SURPRISE)
         self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
 
-    def compare(self, fit: FullFit) -> None:
-        """Ask a new touch for all damages. A fit that is no answer may show one all the same."""
-        before = self._log_cells
-        if before is not None and np.abs(fit.log_cells - before).max() < MAX_STEP_LOG:
+    def compare(self, fit: FullFit, rise_log: Float) -> None:
+        """Ask a new touch for all damages. A fit that is no answer may show one all the same.
+
+        rise_log: how far the cells of this fit conduct more than at rest, (RC,) [log S].
+        """
+        touch = np.maximum(rise_log, 0.0)
+        touch = touch / max(float(np.linalg.norm(touch)), 1e-9)
+        if self._touch @ touch > ALIKE:
             return
-        self._log_cells = fit.log_cells
+        self._touch = touch
         shorts, yarns = fit.gains_of_shorts(self._pairs, SHORT_OHM), fit.gains_of_yarns()
         # A short looks like broken yarns, too; a broken yarn does not look like a short.
         self._shorts = _summed(self._shorts, shorts)
