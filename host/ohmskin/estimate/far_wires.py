@@ -236,11 +236,13 @@ class MeasuredWires(WireBelief):
         self._nominal, self._prior_covariance = self._known.means, np.diag(bend)
         self._means_before = self._nominal, bend
 
-    def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
+    def after_fit(
+        self, fit: Fit, ports: PortReadings, rise_log: Float, *, again: bool = False
+    ) -> bool:
         """Learn from a frame that is news: the means, measured once more, and single segments."""
-        if not self._is_news(fit.log_cells):
+        if not self._is_news(fit.log_cells, rise_log):
             return False
-        self._lesson_cells = fit.log_cells
+        self._lesson_cells, self._news_rise_log = fit.log_cells, rise_log
         circuit = self.circuit(fit.log_cells, self.means, PortCircuit)
         offset = self._measure(circuit, ports)
         if self.fault:

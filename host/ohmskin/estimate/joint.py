@@ -52,7 +52,7 @@ from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_tou
 from ohmskin.estimate.staying_faults import StayingFaults
 from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, WireBelief
 
-# The first two numbers are chosen. `make ablate` tries other ones; the table "What each number
+# The first three numbers are chosen. `make ablate` tries other ones; the table "What each number
 # earns" of docs/estimate.md says what came of it.
 
 # Fits of the rest readings. Each has a prior about the median of the cells that the fit before it
@@ -60,10 +60,10 @@ from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, WireBelief
 REST_FITS: Final = 3
 # A cell that conducts less than at rest by more deviations of its prior is at fault.
 LOSS_STDS: Final = 10.0
-
 # And the frame must show it: by more deviations of the cell after the fit. Chosen: beside
 # fingertips on 16x16, cells at rest seem to conduct less by up to 2.5, once in 250 frames.
-SHOWN_STDS: Final = 3.0
+SHOWN_STDS: Final = 2.5
+
 # Fits expect leaks if these explain so much of how cells differ at rest: it is the gain in twice
 # the log likelihood. Chosen: few sound skins gain as much by chance, and it costs them some time
 # and next to no accuracy. Leaks of 10 MOhm gain more, and neglected they spoil most frames.
@@ -221,7 +221,10 @@ class JointEstimator(Estimator):
         touches = self._few_touches(prior, ports)
         if touches is not None and (touched := self._explained_by(touches)):
             solution = self._solution(ports, touched)
-            again = not ports.fault and self._belief.after_fit(touched, ports, again=again)
+            rise_log = prior.expected - touched.log_cells
+            again = not ports.fault and self._belief.after_fit(
+                touched, ports, rise_log, again=again
+            )
             self._whole_message = self._belief.fault
             # The cells are by what was believed before; the wires have learned from this frame.
             wires = self._belief.believed_wires()
@@ -246,13 +249,13 @@ class JointEstimator(Estimator):
             # knows better which cells are at rest.
             fit = FullFit(prior, self._belief, self.knowledge.ref_ohm, ports, fit.log_cells)
         self._touches = prior.touches(fit.log_cells)
-        message = self._doubt(prior, fit)
+        message, rise_log = self._doubt(prior, fit), prior.expected - fit.log_cells
         # A palm tells of no fault: that so many cells are pressed is a surprise by itself.
         silent = ports.fault or again or spread_share > TELLING_SHARE
         if not silent and ports.current.size >= LEAST_STAYING_PORTS:
             self._staying.count(fit, is_doubted=bool(message))
             if not self._hides_rest:
-                self._staying.compare(fit, prior.expected - fit.log_cells)
+                self._staying.compare(fit, rise_log)
         if not ports.fault:
             message = self._staying.named or message or self._staying.unnamed
         solution = self._solution(ports, fit, message)  # now: a lesson moves the belief
@@ -260,7 +263,7 @@ class JointEstimator(Estimator):
         if ports.fault or message or prior.is_soft(fit.log_cells, self._shape):
             again = False
         else:
-            again = self._belief.after_fit(fit, ports, again=again)
+            again = self._belief.after_fit(fit, ports, rise_log, again=again)
         self._belief.expect_usual(True)
         return solution, again
 

@@ -18,8 +18,8 @@ A lesson is one step of a Kalman filter,
 No lead is below 0. So a mean lead that comes out below 0 is moved to 0, and what V says of it is
 taken for the other means.
 
-The first frame of a touch is noisy, as it changes. A calmer one of the same touch takes its place:
-its step starts from m and V as they were before the touch.
+The first frame of a touch is soft and noisy, as it changes. A harder or a calmer one of the same
+touch takes its place: its step starts from m and V as they were before the touch.
 
 A single touch reveals nothing of the wires, because its own resistance is in the same reading. So N
 holds the touched cells as noise without limit. A lead is in all readings of its line, so each
@@ -114,7 +114,8 @@ class LearnedWires(WireBelief):
     def reset(self) -> None:
         """Back to the nominal wires; single segments in m, too, are nominal ones again."""
         super().reset()
-        self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
+        # Of the last lesson: mean deviation of its currents [S], and how much its cells rose.
+        self._lesson_noise, self._lesson_rise = np.inf, 0.0
         known = _Filter(self._known.means, self._known.covariance)
         self._filters = self._before_lesson = [known] * 2
 
@@ -137,17 +138,25 @@ class LearnedWires(WireBelief):
     def fix_rest_wires(self) -> None:
         """Nothing: an untouched skin shows no wires, as its cells resist far more than they do."""
 
-    def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
-        """Learn from a touch that is new, or again from a calmer frame of the last one.
+    def after_fit(
+        self, fit: Fit, ports: PortReadings, rise_log: Float, *, again: bool = False
+    ) -> bool:
+        """Learn from a touch that is new, or again from a harder or calmer frame of the last one.
 
-        The calmer frame must not count as one more, since both have the touch's errors. So it
-        takes the place of the other.
+        This frame must not count as one more, since both have the touch's errors. So it takes the
+        place of the other.
         """
-        noise = float(ports.current_std.mean())
-        is_news = self._is_news(fit.log_cells)
-        if not (again or is_news or noise < self._lesson_noise):
+        noise, rise = float(ports.current_std.mean()), float(np.linalg.norm(rise_log))
+        is_news = self._is_news(fit.log_cells, rise_log)
+        if self._has_moved(fit.log_cells):
+            tells_more = is_news or rise > self._lesson_rise
+        else:
+            tells_more = noise < self._lesson_noise
+        if not (again or tells_more):
             return False
-        self._lesson_cells, self._lesson_noise = fit.log_cells, noise
+        if is_news:
+            self._news_rise_log = rise_log
+        self._lesson_cells, self._lesson_noise, self._lesson_rise = fit.log_cells, noise, rise
         before = self._known.means
         self.take(fit.lesson, replace_last=again or not is_news)
         moved = np.abs(self._known.means - before)[:3]

@@ -90,7 +90,7 @@ LEFT_OUT_STDS: Final = 0.25
 # With a larger chi-square per port, no resistances explain the readings.
 MAX_CHI2: Final = 1.5
 # No step of a fit moves a log resistance by more, which is a factor of 4.5. And a frame in which a
-# cell differs from the last lesson by as much may teach something new of the wires.
+# cell differs from the last lesson by as much may teach more of the wires.
 MAX_STEP_LOG: Final = 1.5
 # Where errors are skewed, the limit of so many deviations is computed. The deviation that is stated
 # is the distance to this limit, divided by so many.
@@ -241,6 +241,17 @@ def rest_level(current_siemens: Float, ref_ohm: float) -> float:
     port_ohm = max(1.0 / max(current, 1e-9) - ref_ohm, 1.0)  # finite, whatever is read
     level = (rows + columns - 1) / (rows * columns * port_ohm)
     return float(min(level, HIGHEST_TOUCH_SIEMENS))
+
+
+def likeness(rise_log: Float, before: Float) -> float:
+    """How alike the touches of two frames are: 1 if one is the other, harder or softer; else less.
+
+    It is the cosine of the angle between both rises; 0 if there is no touch.
+
+    rise_log, before: how far their cells conduct more than at rest, (RC,) [log S].
+    """
+    one, other = np.maximum(rise_log, 0.0), np.maximum(before, 0.0)
+    return float(one @ other / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-9))
 
 
 class UpperLimits(NamedTuple):

@@ -31,10 +31,14 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.full_fit import FullFit
+from ohmskin.estimate.prior import likeness
 
 # Resistance of a short [ohm]. Chosen: of two threads that touch. Most shorts of up to some hundred
 # ohm look about the same.
 SHORT_OHM: Final = 20.0
+# A touch is the same as the last one if both are more alike. Chosen: a fingertip has to move by a
+# third of its width.
+SAME_TOUCH: Final = 0.95
 # What one touch adds to a sum, or takes from it, at the most. Chosen: five touches have to agree.
 MOST_GAIN: Final = 8.0
 # Two frames show the same touch if the angle between the rises of their cells has a larger cosine.
@@ -68,8 +72,7 @@ class StayingFaults:
         self._pairs = np.concatenate([np.arange(rows - 1), np.arange(rows, rows + columns - 1)])
         self._surprise = 0.0
         self._shorts, self._yarns = np.zeros(len(self._pairs)), np.zeros(sum(self._shape))
-        # How cells rose in the last touch that was asked, to a length of 1, (RC,).
-        self._touch = np.zeros(rows * columns)
+        self._rise_log = np.zeros(rows * columns)  # of the last touch that was asked
 
     def count(self, fit: FullFit, *, is_doubted: bool) -> None:
         """Count how much this frame surprises the model. is_doubted: its fit is no answer."""
@@ -81,11 +84,9 @@ class StayingFaults:
 
         rise_log: how far the cells of this fit conduct more than at rest, (RC,) [log S].
         """
-        touch = np.maximum(rise_log, 0.0)
-        touch = touch / max(float(np.linalg.norm(touch)), 1e-9)
-        if self._touch @ touch > ALIKE:
+        if likeness(rise_log, self._rise_log) > SAME_TOUCH:
             return
-        self._touch = touch
+        self._rise_log = rise_log
         shorts, yarns = fit.gains_of_shorts(self._pairs, SHORT_OHM), fit.gains_of_yarns()
         # A short looks like broken yarns, too; a broken yarn does not look like a short.
         self._shorts = _summed(self._shorts, shorts)

@@ -66,6 +66,7 @@ from ohmskin.estimate.prior import (
     USUAL_LAYER_STD,
     USUAL_LEAD_STD_OHM,
     UpperLimits,
+    likeness,
 )
 
 # A frame is fitted again if its lesson moves the log of a mean by more. Chosen: 30 %, up to which
@@ -73,6 +74,9 @@ from ohmskin.estimate.prior import (
 LARGE_MOVE_LOG: Final = 0.3
 # A frame is fitted so often at most. Chosen: the time of a frame stays bounded.
 MOST_FITS: Final = 4
+# A frame gives no lesson of its own if its touch is more like the last one. Chosen: on 16x16, a
+# fingertip has to move by about its width.
+SAME_LESSON: Final = 0.5
 # A leak of a fit may be this far below 0 [uS]. No leak is, but a limit at 0, of which slopes do not
 # know, would keep fits of small leaks from ending. Chosen: as much as 10 MOhm, the other way.
 LOWEST_LEAK_US: Final = -0.1
@@ -258,6 +262,8 @@ class WireBelief(ABC):
         `learn_segments`.
         """
         self._lesson_cells: Float | None = None  # log resistances of the last lesson's frame
+        # How cells rose in the first lesson of the last touch, (RC,).
+        self._news_rise_log = np.zeros(self.leads_of_ports.shape[0])
         self._believe(self._nominal, self._prior_covariance)
 
     def _believe(self, means: Float, covariance: Float) -> None:
@@ -298,9 +304,12 @@ class WireBelief(ABC):
         """
 
     @abstractmethod
-    def after_fit(self, fit: Fit, ports: PortReadings, *, again: bool = False) -> bool:
+    def after_fit(
+        self, fit: Fit, ports: PortReadings, rise_log: Float, *, again: bool = False
+    ) -> bool:
         """Learn from a frame whose fit is to be trusted.
 
+        rise_log: how far its cells conduct more than at rest, (RC,) [log S].
         again: it is another fit of the same frame, in place of what the last one has taught.
         Returns whether this has moved what is believed so far that the frame wants another fit:
         slopes hold for small moves only.
@@ -310,14 +319,19 @@ class WireBelief(ABC):
     def fix_rest_wires(self) -> None:
         """Take what is believed now, after fits of the rest readings, for the wires at rest."""
 
-    def _is_news(self, log_cells: Float) -> bool:
-        """Whether these cells (RC,) differ from the last lesson's by `MAX_STEP_LOG` somewhere.
-
-        Frames that are alike have errors that are alike, from the same drift of cells and the same
-        odd segments. A lesson from each of them would count one error as many independent ones.
-        """
+    def _has_moved(self, log_cells: Float) -> bool:
+        """Whether these cells (RC,) differ from the last lesson's by `MAX_STEP_LOG` somewhere."""
         before = self._lesson_cells
         return before is None or bool(np.abs(log_cells - before).max() >= MAX_STEP_LOG)
+
+    def _is_news(self, log_cells: Float, rise_log: Float) -> bool:
+        """Whether these cells (RC,) show another touch than that of the last lesson.
+
+        Frames of one touch have errors that are alike, from the same drift of cells and the same
+        odd segments. A lesson from each of them would count one error as many independent ones.
+        """
+        is_other = likeness(rise_log, self._news_rise_log) <= SAME_LESSON
+        return is_other and self._has_moved(log_cells)
 
     @property
     def fault(self) -> str:
