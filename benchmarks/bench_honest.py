@@ -24,6 +24,7 @@ references  of each mode: both off by 5 %, of which estimators are told 1 % or 5
 damp    of each mode: neighbouring stripes leak into each other by so many ohm at every crossing.
 palms   a palm over 60 % of the skin, with peaks of about 250 uS (firm); cells of 200 and 30 kOhm at
         rest (rest_200000, rest_30000). error, p90: of pressed cells, median and 90th percentile.
+large   sound skins of 16x16 cells, of modes near and far; palms, too.
 damages a segment of ten times its resistance (segment), 20 ohm between two rows (short). named:
         scenes in which a message names these rows. misnamed: scenes in which one names others.
 untold  wires of 150, 500, 1000 and 2000 ohm a segment.
@@ -64,7 +65,6 @@ from studies.unmodelled import lost
 SEED = 24000  # of the first skin
 SKINS, FRAMES = 4, 60  # of each condition
 REST_FRAMES = 90  # whose mean is the rest readings
-SHAPE = (8, 8)
 NOISE_LSB = 0.3
 LEAD_OHM = 100.0
 METHODS, KINDS = ("joint", "touch"), ("random", "fingers")
@@ -102,6 +102,7 @@ class Scene(NamedTuple):
     ref_log_std: float = 0.0
     leak_ohm: float = 0.0
     rest_ohm: float = REST_OHM
+    shape: tuple[int, int] = (8, 8)
 
 
 class Shown(NamedTuple):
@@ -128,12 +129,12 @@ def broken(ratio: Float, fault: str, number: int) -> Float:
 def trial_of_scene(scene: Scene, frames: int) -> tuple[Skin, Float]:
     """The untouched skin, and the cells of all frames, (F, R, C) [S]."""
     if scene.kind == "random":
-        trial = random_trial(*SHAPE, 8, frames, scene.seed, wire_ohm=scene.wire_ohm)
+        trial = random_trial(*scene.shape, 8, frames, scene.seed, wire_ohm=scene.wire_ohm)
     elif scene.kind == "palms":
-        trial = palm_trial(*SHAPE, frames, scene.seed)
+        trial = palm_trial(*scene.shape, frames, scene.seed)
     else:
         trial = finger_trial(
-            *(*SHAPE, frames, scene.seed),
+            *(*scene.shape, frames, scene.seed),
             sigma_cells=(0.6, 1.0),
             peak_siemens=(3e-5, 3e-4),
             wire_ohm=scene.wire_ohm,
@@ -153,8 +154,8 @@ def trial_of_scene(scene: Scene, frames: int) -> tuple[Skin, Float]:
 
 def circuits(scene: Scene, rest: Skin) -> tuple[SkinCircuit, SkinCircuit]:
     """The circuit of the rest readings, and that of frames."""
-    more = leaks(SHAPE, scene.leak_ohm) if scene.leak_ohm else None
-    row, column = np.divmod(scene.seed * 7 % rest.cell_siemens.size, SHAPE[1])
+    more = leaks(scene.shape, scene.leak_ohm) if scene.leak_ohm else None
+    row, column = np.divmod(scene.seed * 7 % rest.cell_siemens.size, scene.shape[1])
     if scene.fault == "segment":
         top_ohm = rest.top_wire_ohm.copy()
         top_ohm[row, column] *= SEGMENT_TIMES
@@ -162,7 +163,7 @@ def circuits(scene: Scene, rest: Skin) -> tuple[SkinCircuit, SkinCircuit]:
     sound = SkinCircuit(rest, more)
     if scene.fault != "short":
         return sound, sound
-    first = row % (SHAPE[0] - 1)  # electrodes are the first nodes
+    first = row % (scene.shape[0] - 1)  # electrodes are the first nodes
     return sound, SkinCircuit(rest, (np.array([[first], [first + 1]]), np.array([SHORT_OHM])))
 
 
@@ -186,7 +187,7 @@ def read_scene(scene: Scene) -> tuple[Scene, Shown]:
     exact += NOISE_LSB * LSB * random.standard_normal(exact.shape)
     ratio = ratio_from_codes(quantise(exact))
     known = SkinKnowledge(
-        *SHAPE,
+        *scene.shape,
         adc_bits=ADC_BITS,
         rest_ratio=ratio[:REST_FRAMES].mean(axis=0),
         reading_names=MODES[scene.mode],
@@ -200,11 +201,11 @@ def read_scene(scene: Scene) -> tuple[Scene, Shown]:
 
 def damaged_lines(scene: Scene) -> str:
     """How a message names what is wrong in this scene."""
-    row = scene.seed * 7 % (SHAPE[0] * SHAPE[1]) // SHAPE[1]
+    row = scene.seed * 7 % (scene.shape[0] * scene.shape[1]) // scene.shape[1]
     if scene.fault == "segment":
         return f"row {row}:"
     if scene.fault == "short":
-        return f"rows {row % (SHAPE[0] - 1)} and {row % (SHAPE[0] - 1) + 1}"
+        return f"rows {row % (scene.shape[0] - 1)} and {row % (scene.shape[0] - 1) + 1}"
     return f"far row {LINE}" if "line" in scene.fault else f"far {scene.fault.split('_')[0]}"
 
 
@@ -362,6 +363,21 @@ def of_palms(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
     return found
 
 
+def of_large(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
+    """Sound skins of 16x16, nothing told; palms on 60 % of their cells."""
+    scenes = [
+        skin._replace(name=f"large_{mode}", mode=mode, shape=(16, 16))
+        for mode in ("near", "far")
+        for skin in skins_of(part, seed, (*KINDS, "palms"), mode=mode)
+    ]
+    found = Pooled(scenes, jobs, progress)
+    for mode, kind in product(("near", "far"), KINDS):
+        found.bar(at_most, f"large_{mode}_{kind}", "wrong", 1)
+        found.bar(at_least, f"large_{mode}_{kind}", "within_4", 95)
+        found.bar(at_most, f"large_{mode}_{kind}", "right_but_flagged", 5)
+    return found
+
+
 def of_damages(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
     """A segment of ten times its resistance, and a short of 20 ohm between two rows."""
     scenes = [
@@ -397,6 +413,7 @@ GROUPS: dict[str, Callable[[Part, int, int, Progress], Pooled]] = {
     "references": of_references,
     "damp": of_damp,
     "palms": of_palms,
+    "large": of_large,
     "damages": of_damages,
     "untold": of_untold,
 }
