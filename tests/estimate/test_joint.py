@@ -333,6 +333,27 @@ def test_a_firm_palm_is_read_by_the_prior_that_knows_cells_at_rest() -> None:
     assert np.quantile(np.concatenate(errors), 0.9) < 0.29
 
 
+@pytest.mark.parametrize("softest", [0.0, 0.1], ids=["taps", "grip"])
+def test_touches_at_the_same_places_show_that_the_skin_was_bent(softest: float) -> None:
+    """By a node Laplacian: ten times let go, or held less hard; then bent, and ten times more."""
+    random = np.random.default_rng(0)
+    rest = skin_at_rest(8, 8, random, wire_ohm=(1e3, 1e3))
+    rise = np.zeros((8, 8))
+    rise[[1, 1, 5, 6], [2, 6, 2, 5]] = 2e-4
+    held = rest.cell_siemens + rise
+    cells = np.array([rest.cell_siemens + softest * rise, held] * 10).repeat(3, axis=0)
+    flat, bent = (SkinCircuit(one) for one in (rest, stretched(rest, 0.7)))
+    untouched = ratio_from_codes(
+        codes_of(flat, np.repeat(rest.cell_siemens[None], 60, axis=0), "near", random)
+    )
+    knowledge = SkinKnowledge(8, 8, adc_bits=10, rest_ratio=untouched.mean(axis=0))
+    estimator = make_estimator("joint", knowledge)
+    for circuit in (flat, bent):
+        for ratio in ratio_from_codes(codes_of(circuit, cells, "near", random)):
+            found = estimator.estimate(ratio)
+    assert np.abs(found.cell_siemens / held - 1)[rise > 0].max() < 0.2
+
+
 @pytest.mark.parametrize("method", ["joint", "touch"])
 def test_a_bent_skin_of_few_cells_is_learned_from_many_touches(method: str) -> None:
     random = np.random.default_rng(3)

@@ -330,7 +330,7 @@ def test_a_lesson_that_says_nothing_asks_for_no_other_fit() -> None:
     assert abs(known - belief.means[2]) > 150  # what asks for another fit
     ports = PortReadings(np.zeros((4, 4)), np.zeros((4, 4)), np.ones((4, 4)))
     belief.expect_usual(False)
-    assert not belief.after_fit(SilentFit(), ports, np.zeros(16))
+    assert not belief.after_fit(SilentFit(), ports)
 
 
 def test_limits_of_untold_wires_count_as_more_deviations_until_frames_teach_them() -> None:

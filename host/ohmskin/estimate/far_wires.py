@@ -237,12 +237,12 @@ class MeasuredWires(WireBelief):
         self._means_before = self._nominal, bend
 
     def after_fit(
-        self, fit: Fit, ports: PortReadings, rise_log: Float, *, again: bool = False
+        self, fit: Fit, ports: PortReadings, tip_log: Float | None = None, *, again: bool = False
     ) -> bool:
-        """Learn from a frame that is news: the means, measured once more, and single segments."""
-        if not self._is_news(fit.log_cells, rise_log):
+        """Learn from a frame that has moved: the means, measured once more, and single segments."""
+        if not self._has_moved(fit.log_cells):
             return False
-        self._lesson_cells, self._news_rise_log = fit.log_cells, rise_log
+        self._lesson_cells = fit.log_cells
         circuit = self.circuit(fit.log_cells, self.means, PortCircuit)
         offset = self._measure(circuit, ports)
         if self.fault:

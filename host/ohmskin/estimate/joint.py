@@ -221,10 +221,7 @@ class JointEstimator(Estimator):
         touches = self._few_touches(prior, ports)
         if touches is not None and (touched := self._explained_by(touches)):
             solution = self._solution(ports, touched)
-            rise_log = prior.expected - touched.log_cells
-            again = not ports.fault and self._belief.after_fit(
-                touched, ports, rise_log, again=again
-            )
+            again = not ports.fault and self._belief.after_fit(touched, ports, again=again)
             self._whole_message = self._belief.fault
             # The cells are by what was believed before; the wires have learned from this frame.
             wires = self._belief.believed_wires()
@@ -263,7 +260,8 @@ class JointEstimator(Estimator):
         if ports.fault or message or prior.is_soft(fit.log_cells, self._shape):
             again = False
         else:
-            again = self._belief.after_fit(fit, ports, rise_log, again=again)
+            tip_log = None if fit_prior is prior else rise_log
+            again = self._belief.after_fit(fit, ports, tip_log, again=again)
         self._belief.expect_usual(True)
         return solution, again
 

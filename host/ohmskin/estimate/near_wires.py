@@ -18,8 +18,9 @@ A lesson is one step of a Kalman filter,
 No lead is below 0. So a mean lead that comes out below 0 is moved to 0, and what V says of it is
 taken for the other means.
 
-The first frame of a touch is soft and noisy, as it changes. A harder or a calmer one of the same
-touch takes its place: its step starts from m and V as they were before the touch.
+The first frame of a touch is noisy, as it changes. A calmer one of the same touch takes its place:
+its step starts from m and V as they were before the touch. Cells at the edge of a fingertip hide
+in all its frames alike: so it is the same touch until it has moved by about its width.
 
 A single touch reveals nothing of the wires, because its own resistance is in the same reading. So N
 holds the touched cells as noise without limit. A lead is in all readings of its line, so each
@@ -51,7 +52,7 @@ wary filter: if wires have just grown longer, cells conduct more than they seem 
 """
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -66,8 +67,13 @@ from ohmskin.estimate.prior import (
     USUAL_LAYER_STD,
     USUAL_LEAD_STD_OHM,
     WARY_ODDS,
+    likeness,
 )
 from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, Fit, Lesson, WireBelief
+
+# A fingertip is the same as that of the last lesson if both are more alike. Chosen: on 16x16, it
+# has to move by about its width.
+SAME_TIP: Final = 0.5
 
 
 class _Filter(NamedTuple):
@@ -114,8 +120,9 @@ class LearnedWires(WireBelief):
     def reset(self) -> None:
         """Back to the nominal wires; single segments in m, too, are nominal ones again."""
         super().reset()
-        # Of the last lesson: mean deviation of its currents [S], and how much its cells rose.
-        self._lesson_noise, self._lesson_rise = np.inf, 0.0
+        self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
+        # How cells rose under the fingertips of the last lesson, or 0, (RC,).
+        self._tip_log = np.zeros(self.leads_of_ports.shape[0])
         known = _Filter(self._known.means, self._known.covariance)
         self._filters = self._before_lesson = [known] * 2
 
@@ -139,24 +146,22 @@ class LearnedWires(WireBelief):
         """Nothing: an untouched skin shows no wires, as its cells resist far more than they do."""
 
     def after_fit(
-        self, fit: Fit, ports: PortReadings, rise_log: Float, *, again: bool = False
+        self, fit: Fit, ports: PortReadings, tip_log: Float | None = None, *, again: bool = False
     ) -> bool:
-        """Learn from a touch that is new, or again from a harder or calmer frame of the last one.
+        """Learn from a touch that is new, or again from a calmer frame of the last one.
 
-        This frame must not count as one more, since both have the touch's errors. So it takes the
-        place of the other.
+        The calmer frame must not count as one more, since both have the touch's errors. So it takes
+        the place of the other. So does a harder frame of a fingertip that has hardly moved.
         """
-        noise, rise = float(ports.current_std.mean()), float(np.linalg.norm(rise_log))
-        is_news = self._is_news(fit.log_cells, rise_log)
-        if self._has_moved(fit.log_cells):
-            tells_more = is_news or rise > self._lesson_rise
+        noise, is_news = float(ports.current_std.mean()), self._has_moved(fit.log_cells)
+        tip = np.zeros_like(fit.log_cells) if tip_log is None else tip_log
+        if is_news and likeness(tip, self._tip_log) > SAME_TIP:
+            is_news, tells_more = False, bool(tip @ tip > self._tip_log @ self._tip_log)
         else:
-            tells_more = noise < self._lesson_noise
+            tells_more = is_news or noise < self._lesson_noise
         if not (again or tells_more):
             return False
-        if is_news:
-            self._news_rise_log = rise_log
-        self._lesson_cells, self._lesson_noise, self._lesson_rise = fit.log_cells, noise, rise
+        self._lesson_cells, self._lesson_noise, self._tip_log = fit.log_cells, noise, tip
         before = self._known.means
         self.take(fit.lesson, replace_last=again or not is_news)
         moved = np.abs(self._known.means - before)[:3]

@@ -66,7 +66,6 @@ from ohmskin.estimate.prior import (
     USUAL_LAYER_STD,
     USUAL_LEAD_STD_OHM,
     UpperLimits,
-    likeness,
 )
 
 # A frame is fitted again if its lesson moves the log of a mean by more. Chosen: 30 %, up to which
@@ -74,9 +73,6 @@ from ohmskin.estimate.prior import (
 LARGE_MOVE_LOG: Final = 0.3
 # A frame is fitted so often at most. Chosen: the time of a frame stays bounded.
 MOST_FITS: Final = 4
-# A frame gives no lesson of its own if its touch is more like the last one. Chosen: on 16x16, a
-# fingertip has to move by about its width.
-SAME_LESSON: Final = 0.5
 # A leak of a fit may be this far below 0 [uS]. No leak is, but a limit at 0, of which slopes do not
 # know, would keep fits of small leaks from ending. Chosen: as much as 10 MOhm, the other way.
 LOWEST_LEAK_US: Final = -0.1
@@ -262,8 +258,6 @@ class WireBelief(ABC):
         `learn_segments`.
         """
         self._lesson_cells: Float | None = None  # log resistances of the last lesson's frame
-        # How cells rose in the first lesson of the last touch, (RC,).
-        self._news_rise_log = np.zeros(self.leads_of_ports.shape[0])
         self._believe(self._nominal, self._prior_covariance)
 
     def _believe(self, means: Float, covariance: Float) -> None:
@@ -305,11 +299,11 @@ class WireBelief(ABC):
 
     @abstractmethod
     def after_fit(
-        self, fit: Fit, ports: PortReadings, rise_log: Float, *, again: bool = False
+        self, fit: Fit, ports: PortReadings, tip_log: Float | None = None, *, again: bool = False
     ) -> bool:
         """Learn from a frame whose fit is to be trusted.
 
-        rise_log: how far its cells conduct more than at rest, (RC,) [log S].
+        tip_log: under fingertips, how far its cells conduct more than at rest, (RC,) [log S].
         again: it is another fit of the same frame, in place of what the last one has taught.
         Returns whether this has moved what is believed so far that the frame wants another fit:
         slopes hold for small moves only.
@@ -320,18 +314,13 @@ class WireBelief(ABC):
         """Take what is believed now, after fits of the rest readings, for the wires at rest."""
 
     def _has_moved(self, log_cells: Float) -> bool:
-        """Whether these cells (RC,) differ from the last lesson's by `MAX_STEP_LOG` somewhere."""
-        before = self._lesson_cells
-        return before is None or bool(np.abs(log_cells - before).max() >= MAX_STEP_LOG)
+        """Whether these cells (RC,) differ from the last lesson's by `MAX_STEP_LOG` somewhere.
 
-    def _is_news(self, log_cells: Float, rise_log: Float) -> bool:
-        """Whether these cells (RC,) show another touch than that of the last lesson.
-
-        Frames of one touch have errors that are alike, from the same drift of cells and the same
+        Frames that are alike have errors that are alike, from the same drift of cells and the same
         odd segments. A lesson from each of them would count one error as many independent ones.
         """
-        is_other = likeness(rise_log, self._news_rise_log) <= SAME_LESSON
-        return is_other and self._has_moved(log_cells)
+        before = self._lesson_cells
+        return before is None or bool(np.abs(log_cells - before).max() >= MAX_STEP_LOG)
 
     @property
     def fault(self) -> str:
