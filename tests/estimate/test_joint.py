@@ -146,6 +146,21 @@ def test_a_cell_that_opened_is_named_though_its_current_hardly_fell(method: str)
     assert found.message == "cell (1, 2): conducts less than at rest, is a line open?"
 
 
+@pytest.mark.parametrize("touches", [0, 12])
+def test_a_cell_of_16x16_that_opened_is_named_in_every_frame(touches: int) -> None:
+    """By a node Laplacian. The log of its resistance is hardly known: it may be anything large."""
+    trial = random_trial(16, 16, touches, 8, 5)
+    random = np.random.default_rng(5)
+    circuit, cells = SkinCircuit(trial.rest), trial.cell_siemens.copy()
+    cells[:, 7, 9] = 1e-9
+    untouched = np.repeat(trial.rest.cell_siemens[None], 60, axis=0)
+    rest = ratio_from_codes(codes_of(circuit, untouched, "near", random)).mean(axis=0)
+    estimator = make_estimator("joint", SkinKnowledge(16, 16, adc_bits=10, rest_ratio=rest))
+    for ratio in ratio_from_codes(codes_of(circuit, cells, "near", random)):
+        message = estimator.estimate(ratio).message
+        assert message == "cell (7, 9): conducts less than at rest, is a line open?"
+
+
 def test_a_hidden_cell_says_that_it_is_uncertain() -> None:
     """A light touch behind wires that a hard one loads: little of it is in the readings."""
     estimate, truth = estimates("wire_sweep_3x3", 10)[4]

@@ -52,17 +52,15 @@ from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_tou
 from ohmskin.estimate.staying_faults import StayingFaults
 from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, MOST_FITS, WireBelief
 
-# The first three numbers are chosen. `make ablate` tries other ones; the table "What each number
-# earns" of docs/estimate.md says what came of it.
-
 # Fits of the rest readings. Each has a prior about the median of the cells that the fit before it
-# found.
+# found. Chosen.
 REST_FITS: Final = 3
-# A cell that conducts less than at rest by more deviations of its prior is at fault.
+# A cell that conducts less than at rest by more deviations of its prior is at fault. Chosen:
+# `make ablate` tries other ones.
 LOSS_STDS: Final = 10.0
-# And the frame must show it: by more deviations of the cell after the fit. Chosen: beside
-# fingertips on 16x16, cells at rest seem to conduct less by up to 2.5, once in 250 frames.
-SHOWN_STDS: Final = 2.5
+# And the frame must show it: by more deviations of its conductance after the fit. Chosen: beside
+# fingertips on 16x16, cells at rest seem to conduct less by up to 3, and open ones by 5 and more.
+SHOWN_STDS: Final = 4.0
 
 # Fits expect leaks if these explain so much of how cells differ at rest: it is the gain in twice
 # the log likelihood. Chosen: few sound skins gain as much by chance, and it costs them some time
@@ -368,9 +366,10 @@ class JointEstimator(Estimator):
         if short or self.knowledge.rest_ratio is None:
             return short
         # Beside fingertips on a large skin, readings say little of a cell at rest: it may seem to
-        # conduct half as much.
-        limit = np.maximum(LOSS_STDS * prior.std, SHOWN_STDS * fit.log_cells_std)
-        loss = fit.log_cells - prior.expected - limit
+        # conduct half as much. The conductance that it lost is counted in its deviation: the log of
+        # an open cell is hardly known, and its conductance is.
+        shown_log = np.log1p(SHOWN_STDS * fit.log_cells_std)
+        loss = fit.log_cells - prior.expected - np.maximum(LOSS_STDS * prior.std, shown_log)
         return worst_cell(loss.reshape(self._shape), LOSS_TEXT)
 
     @property

@@ -31,7 +31,7 @@ import numpy as np
 
 from ohmskin.arrays import Float
 from ohmskin.estimate.full_fit import FullFit
-from ohmskin.estimate.prior import likeness
+from ohmskin.estimate.prior import MAX_STEP_LOG, likeness
 
 # Resistance of a short [ohm]. Chosen: of two threads that touch. Most shorts of up to some hundred
 # ohm look about the same.
@@ -41,9 +41,6 @@ SHORT_OHM: Final = 20.0
 SAME_TOUCH: Final = 0.95
 # What one touch adds to a sum, or takes from it, at the most. Chosen: five touches have to agree.
 MOST_GAIN: Final = 8.0
-# Two frames show the same touch if the angle between the rises of their cells has a larger cosine.
-# Chosen: a fingertip has to move by about its width.
-ALIKE: Final = 0.85
 # A sum from here on is a damage. Chosen: of 168 simulated sound boards, and 160 skins of up to 300
 # touches with wires of 10 to 30 % scatter, the largest was 23.
 CERTAIN_GAIN: Final = 40.0
@@ -72,7 +69,7 @@ class StayingFaults:
         self._pairs = np.concatenate([np.arange(rows - 1), np.arange(rows, rows + columns - 1)])
         self._surprise = 0.0
         self._shorts, self._yarns = np.zeros(len(self._pairs)), np.zeros(sum(self._shape))
-        self._rise_log = np.zeros(rows * columns)  # of the last touch that was asked
+        self._rise_log: Float | None = None  # of the last touch that was asked
 
     def count(self, fit: FullFit, *, is_doubted: bool) -> None:
         """Count how much this frame surprises the model. is_doubted: its fit is no answer."""
@@ -84,8 +81,10 @@ class StayingFaults:
 
         rise_log: how far the cells of this fit conduct more than at rest, (RC,) [log S].
         """
-        if likeness(rise_log, self._rise_log) > SAME_TOUCH:
-            return
+        if (before := self._rise_log) is not None:
+            moved_log = np.abs(rise_log - before).max()
+            if moved_log < MAX_STEP_LOG or likeness(rise_log, before) > SAME_TOUCH:
+                return
         self._rise_log = rise_log
         shorts, yarns = fit.gains_of_shorts(self._pairs, SHORT_OHM), fit.gains_of_yarns()
         # A short looks like broken yarns, too; a broken yarn does not look like a short.

@@ -303,7 +303,8 @@ class WireBelief(ABC):
     ) -> bool:
         """Learn from a frame whose fit is to be trusted.
 
-        tip_log: under fingertips, how far its cells conduct more than at rest, (RC,) [log S].
+        tip_log: of a frame with fingertips, how far all its cells conduct more than at rest, (RC,)
+            [log S].
         again: it is another fit of the same frame, in place of what the last one has taught.
         Returns whether this has moved what is believed so far that the frame wants another fit:
         slopes hold for small moves only.
