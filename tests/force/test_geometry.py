@@ -99,10 +99,34 @@ def test_contacts_and_scans_have_places_and_sums(tmp_path: Path) -> None:
         assert contact.position_m == pytest.approx(known.position_m[cell])
         assert contact.normal == pytest.approx(known.normal[cell])
     force_n, torque_nm = scan.wrench
-    pushes = [(f, known.position_m[c], known.normal[c]) for c, f in np.ndenumerate(scan.force_n)]
+    at = [(2, 2), (2, 5), (5, 2)]
+    pushes = [
+        (f, known.position_m[c], known.normal[c])
+        for c, f in np.ndenumerate(scan.force_n)
+        if any(abs(c[0] - row) <= 1 and abs(c[1] - column) <= 1 for row, column in at)
+    ]
     assert force_n == pytest.approx(sum(-f * n for f, _, n in pushes))
     assert torque_nm == pytest.approx(sum(np.cross(p, -f * n) for f, p, n in pushes))
     assert force_n[2] < -1
+
+
+def test_the_noise_of_untouched_cells_is_no_net_force(tmp_path: Path) -> None:
+    """No force of a cell is below 0: the sum of all is above 0 on a skin that nothing touches."""
+    placed = replace(of_scene("rest"), geometry=geometry(tmp_path / "skin.json", FLAT))
+    with ohmskin.open("emulator://8x8?scene=rest&seed=1&speed=0", calibration=placed) as skin:
+        scan = next(iter(skin))
+    noisy = replace(scan, force_n=np.full((8, 8), 0.005))
+    assert np.abs(noisy.wrench).max() == 0.0
+
+
+def test_a_net_force_has_the_weak_edge_of_a_touch(tmp_path: Path) -> None:
+    """Of 1 N that lies on some twenty cells, those that count as touched have 0.85 N."""
+    placed = replace(of_scene("rest"), geometry=geometry(tmp_path / "skin.json", FLAT))
+    row, column = np.indices((8, 8))
+    share = np.exp(-((row - 3.3) ** 2 + (column - 3.7) ** 2) / 2)
+    scan = ohmskin.SimulatedSkin(placed).step(share / share.sum(), 0.0)
+    assert sum(contact.force_n for contact in scan.contacts) < 0.9
+    assert scan.wrench[0] == pytest.approx([0, 0, -1], abs=0.03)
 
 
 def test_without_forces_a_wrench_says_so(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from ohmskin.estimate.knowledge import NO_WIRES, REF_LOG_STD, SkinKnowledge
 from ohmskin.estimate.methods import kind_of, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
-from ohmskin.force.contacts import Contact, ContactTracker, found
+from ohmskin.force.contacts import Contact, ContactTracker, around, found
 from ohmskin.force.focus import FOLLOWING, Focus
 from ohmskin.force.geometry import Geometry, required
 from ohmskin.link.codes import quantise
@@ -76,11 +76,16 @@ class ForceScan(Scan):
     def wrench(self) -> tuple[Float, Float]:
         """Net force (3,) [N] and torque (3,) [N m] on the skin: `Geometry.wrench`.
 
+        Cells count that are touched, and those around them. No force is below 0, so the noise of
+        all other cells would add up: to more than 1 N on an untouched skin of 16x16.
+
         :raises ValueError: there are no forces, or no geometry.
         """
         if self.geometry is None and np.isnan(self.force_n).all():
             raise ValueError("no forces: read scans with a calibration, and by its own method")
-        return required(self.geometry).wrench(self.force_n)
+        of_touches = around(self.contacts, self.force_n.shape)
+        force_n = np.where(of_touches | np.isnan(self.force_n), self.force_n, 0.0)
+        return required(self.geometry).wrench(force_n)
 
     def _repr_html_(self) -> str:
         """A heat map of the forces, in a notebook; of the conductances where there are none."""
