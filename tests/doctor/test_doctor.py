@@ -221,6 +221,16 @@ def test_hum_that_stands_still_shows_at_another_rate() -> None:
         assert finding.kind is Kind.HUM
 
 
+@pytest.mark.parametrize("size", ["8x8", "6x12", "16x16"])
+def test_a_touch_that_begins_in_the_second_look_is_no_settling(size: str) -> None:
+    """It was: the scene begins after two seconds. The doctor said to wait longer for readings."""
+    read = evidence(f"emulator://{size}?scene=ghost")
+    assert read.again is not None
+    assert [one.kind for one in examine(read).findings] == [Kind.TOUCHED]
+    assert [one.kind for one in examine(replace(read, again=None)).findings] == [Kind.SETTLING]
+    assert evidence(f"emulator://{size}").again is None
+
+
 @pytest.mark.parametrize("url", ["8x8?hum=50&rate=50", "8x8?hum=60&rate=60", "4x4?hum=50&rate=50"])
 def test_hum_that_stands_still_is_no_fault_of_the_references(url: str) -> None:
     assert told(f"emulator://{url}") == [("hum", "whole skin")]

@@ -15,11 +15,19 @@ from typing import Final
 
 import numpy as np
 
+from ohmskin.arrays import Bool
 from ohmskin.circuit.small import one_blas_thread
 from ohmskin.doctor.circuit import examine_circuit, examine_leaks
 from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, Severity, merged
-from ohmskin.doctor.signal import Look, Rest, examine_settling, examine_signal
+from ohmskin.doctor.limits import ALL_STDS
+from ohmskin.doctor.signal import (
+    MOVED_LSB,
+    Look,
+    Rest,
+    examine_settling,
+    examine_signal,
+)
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
@@ -40,6 +48,7 @@ class Evidence:
     scans: the first look, by this configuration.
     stats: counts of the connection.
     settled: a look with a longer settle time.
+    again: a look as the first, after `settled`, if that showed other means.
     report: the board's self-test.
     told: what is told of wires and leads. Wires are at fault only if nominal ones are told.
     presses: scans while somebody pressed corners, after all other looks.
@@ -55,6 +64,7 @@ class Evidence:
     scans: list[Scan] = field(default_factory=list)
     stats: BoardStats = field(default_factory=BoardStats)
     settled: Look | None = None
+    again: Look | None = None
     report: SelfTestReport | None = None
     told: WireOhm = NO_WIRES
     presses: CornerScans | None = None
@@ -64,6 +74,15 @@ class Evidence:
     loss: float = 0.0
     pressed: list[Look | None] = field(default_factory=list)
 
+    def moved_meanwhile(self, later: Look | None) -> Bool:
+        """Cells (R, C) whose means differ between the first look and a later one, as by a touch."""
+        first = Look.of(self.board, self.scans)
+        if first is None or later is None:
+            return np.zeros((self.board.rows, self.board.columns), dtype=bool)
+        noise_lsb = later.codes.std(axis=0) / len(later.codes) ** 0.5
+        limit_lsb = MOVED_LSB + ALL_STDS * noise_lsb
+        return np.asarray((np.abs(later.mean - first.mean) > limit_lsb).any(axis=2))
+
 
 def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     """Add what the scans show of a skin: signal, lines, cells, far ends, and wires.
@@ -72,6 +91,7 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
     """
     settled, presses, far = evidence.settled, evidence.presses, usual.board.mode == "far"
     noise_lsb, moved = examine_signal(usual, diagnosis, settled)
+    moved = moved | evidence.moved_meanwhile(evidence.again)
     moves, scans, is_too_short = bool(moved.any()), usual, False
     if settled is not None and not moves:
         is_too_short = examine_settling(usual, settled, diagnosis)

@@ -11,7 +11,15 @@ from enum import Enum, auto
 from typing import Any, Final
 
 from ohmskin.doctor.examine import Evidence
-from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, NOISE_S, REST_S, SETTLED_S, Look, second_look
+from ohmskin.doctor.signal import (
+    FAR_S,
+    LEAST_SCANS,
+    NOISE_S,
+    REST_S,
+    SETTLED_S,
+    Look,
+    second_look,
+)
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.errors import CommandRefused, DeviceLost, RecordingEnded
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
@@ -92,11 +100,15 @@ def gather(
             raise ValueError("nothing in it is of the whole skin, in mode near or far: record that")
         evidence.board = complete[0]
         settling = second_look(evidence.board)
+        usual = {"rate_hz": board.rate_asked_mhz / 1000, "settle_us": board.settle_asked_us}
         with suppress(CommandRefused), put_back(device):
             if settling is not None:
                 report(Step.LONGER_SETTLING, None)
                 far = evidence.board.mode == "far"
                 evidence.settled = _look(device, FAR_S if far else SETTLED_S, settling)
+                # By the settle time, or by a touch. Far ends may float, and change as well.
+                if not far and evidence.moved_meanwhile(evidence.settled).any():
+                    evidence.again = _look(device, NOISE_S, usual)
             for clock in ENUMS["accuracy"].values if clocks else ():
                 report(Step.ADC_CLOCK, clock)
                 # As fast as it can: a slow clock does not reach the rate of the board.
@@ -112,8 +124,6 @@ def gather(
             if presses.done and settling is not None:
                 report(Step.PRESSED_SETTLING, None)
                 with suppress(CommandRefused), put_back(device):
-                    rate_hz, settle_us = board.rate_asked_mhz / 1000, board.settle_asked_us
-                    usual = {"rate_hz": rate_hz, "settle_us": settle_us}
                     for turn in TURNS * (usual, settling):
                         evidence.pressed.append(_look(device, TURN_S, turn))
     except RecordingEnded:
