@@ -5,12 +5,14 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from command_line import Run, python
+from ohmskin.cli.stream import coloured
 from ohmskin.cli.terminal import Terminal, printable
 from recordings import URL, scan, write_recording
 from stepped import stepped
@@ -51,6 +53,15 @@ def test_tables_and_live_pictures_show_text_alone(text: str) -> None:
     assert said.count(HOSTILE[text]) >= 2  # columns are as wide as what is left without escapes
     assert "title\x07" not in file.getvalue()
     assert "\x1b[2J" not in file.getvalue()
+
+
+def test_a_table_of_16x16_fits_into_a_terminal_with_four_lines_beside_it() -> None:
+    """The live picture of 21 lines and four more was cut at its end, which has the contacts."""
+    file = io.StringIO()
+    Terminal(file=file, width=80).print(coloured(np.full((16, 16), 12.3), 500.0))
+    lines = file.getvalue().splitlines()
+    assert len(lines) <= 24 - 4
+    assert max(map(len, lines)) <= 80
 
 
 def test_names_of_files_are_text(tmp_path: Path) -> None:

@@ -488,9 +488,13 @@ def _finish(
         TERMINAL.print(note)
     if not model.pooled.all():
         errors = np.char.mod("%.2f", model.held_out_rmse), np.char.mod(" (%d)", presses.counts)
-        texts = np.where(model.pooled, "-", np.char.add(*errors)).tolist()
+        texts = np.where(model.pooled, "-", np.char.add(*errors))
         title = "held-out error [N], of so many presses, of cells' own curves"
-        TERMINAL.print(cell_table(texts, title))
+        if sum(2 + np.char.str_len(texts).max(axis=0)) > TERMINAL.width:
+            hundredths = np.char.mod("%.0f", 100 * model.held_out_rmse)
+            texts = np.where(model.pooled, "-", hundredths)
+            title = "held-out error [0.01 N] of cells' own curves"
+        TERMINAL.print(cell_table(texts.tolist(), title))
     if message:
         error_n = model.held_out_rmse[model.pooled].max()  # NaN where one cell alone was pressed
         TERMINAL.print(

@@ -212,7 +212,8 @@ def _short(value: float) -> str:
 
 def cell_table(cells: Sequence[Sequence[str | Text]], title: str) -> Table:
     """A text for each cell, row by row, beside the numbers of rows and columns."""
-    table = Table(title=title, box=SIMPLE_HEAD, padding=0)  # 16 columns fit into a terminal
+    # 16 rows of 16 cells of three characters fit into a terminal, with four lines beside them.
+    table = Table(title=title, box=SIMPLE_HEAD, padding=0, show_edge=False)
     table.add_column("", justify="right", style="dim")
     for column in range(len(cells[0])):
         width = max(3, *(len(row[column]) for row in cells))
