@@ -123,6 +123,7 @@ class Kneading:
         """Find the wires, unless the estimator shows them, and fit the curves.
 
         log: forces of the scale, on the clock of the scans; only the scale's own lag is in them.
+        progress: passes on the scans that are read, once for each trial of wires, and at last.
         lags: as in `Totals`. A scale that does not lag shows the force of some scans, such as
             known weights do: then only scans whose force is known are used.
         """
@@ -132,7 +133,7 @@ class Kneading:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
         wires, are_sure = calibrator.knowledge.nominal_wire_ohm, not calibrator.shows_wires
         if are_sure:
-            search = WireSearch(wires, self.shape, partial(self._shown, log))
+            search = WireSearch(wires, self.shape, partial(self._shown, log, progress))
             calibrator.take_wires(search.found())
             # The curves are of the wires that were found, and not of what scans would teach.
             wires = held(calibrator.knowledge.nominal_wire_ohm)
@@ -172,9 +173,10 @@ class Kneading:
         count = np.cumsum(np.diff(np.maximum.accumulate(press), prepend=-1) > 0) - 1
         return np.asarray(used & (count // STRETCH % (cells // most_cells + 1) == 0))
 
-    def _shown(self, log: ForceLog, wires: WireOhm, most_cells: int) -> Shown:
+    def _shown(self, log: ForceLog, progress: Progress, wires: WireOhm, most_cells: int) -> Shown:
         """What these wires make of some stretches of presses."""
-        levels = self._levels(DEFAULT_METHOD, wires, self._in_stretches(log, most_cells))
+        used = self._in_stretches(log, most_cells)
+        levels = self._levels(DEFAULT_METHOD, wires, used, progress)
         wires = levels.estimator.wires()
         return Shown(self._totals(levels, log), self._slopes(wires, levels), wires)
 
