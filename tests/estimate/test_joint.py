@@ -29,6 +29,7 @@ from ohmskin.link.codes import quantise, ratio_from_codes
 from pressed_skin import codes_of
 from skins import reference, ten_bits, told
 from studies.trials import (
+    Trial,
     finger_trial,
     palm_trial,
     random_trial,
@@ -36,6 +37,15 @@ from studies.trials import (
     stretched,
     touch,
 )
+
+
+def of_a_board(trial: Trial, cells: Float, seed: int) -> tuple[SkinKnowledge, Float]:
+    """What a board of 10 bits and some noise reads, by a node Laplacian: rest, and these frames."""
+    circuit, random = SkinCircuit(trial.rest), np.random.default_rng(seed)
+    untouched = np.repeat(trial.rest.cell_siemens[None], 60, axis=0)
+    rest = ratio_from_codes(codes_of(circuit, untouched, "near", random)).mean(axis=0)
+    frames = ratio_from_codes(codes_of(circuit, cells, "near", random))
+    return SkinKnowledge(*trial.rest.shape, adc_bits=10, rest_ratio=rest), frames
 
 
 def estimates(name: str, bits: int | None) -> list[tuple[Estimate, dict[str, Float]]]:
@@ -148,15 +158,13 @@ def test_a_cell_that_opened_is_named_though_its_current_hardly_fell(method: str)
 
 @pytest.mark.parametrize("touches", [0, 12])
 def test_a_cell_of_16x16_that_opened_is_named_in_every_frame(touches: int) -> None:
-    """By a node Laplacian. The log of its resistance is hardly known: it may be anything large."""
+    """The log of its resistance is hardly known: it may be anything large."""
     trial = random_trial(16, 16, touches, 8, 5)
-    random = np.random.default_rng(5)
-    circuit, cells = SkinCircuit(trial.rest), trial.cell_siemens.copy()
+    cells = trial.cell_siemens.copy()
     cells[:, 7, 9] = 1e-9
-    untouched = np.repeat(trial.rest.cell_siemens[None], 60, axis=0)
-    rest = ratio_from_codes(codes_of(circuit, untouched, "near", random)).mean(axis=0)
-    estimator = make_estimator("joint", SkinKnowledge(16, 16, adc_bits=10, rest_ratio=rest))
-    for ratio in ratio_from_codes(codes_of(circuit, cells, "near", random)):
+    knowledge, frames = of_a_board(trial, cells, 5)
+    estimator = make_estimator("joint", knowledge)
+    for ratio in frames:
         message = estimator.estimate(ratio).message
         assert message == "cell (7, 9): conducts less than at rest, is a line open?"
 
@@ -307,24 +315,18 @@ def test_the_deviation_covers_wires_of_1_kohm_that_nobody_told() -> None:
 
 
 def test_a_cell_at_rest_beside_fingertips_on_16x16_is_not_called_open() -> None:
-    """By a node Laplacian. Half of these frames were doubted: cells there are hardly known."""
+    """Half of these frames were doubted: cells there are hardly known."""
     trial = finger_trial(16, 16, 20, 9001)
-    circuit, random = SkinCircuit(trial.rest), np.random.default_rng(1)
-    codes = codes_of(circuit, np.repeat(trial.rest.cell_siemens[None], 60, axis=0), "near", random)
-    rest = ratio_from_codes(codes).mean(axis=0)
-    frames = ratio_from_codes(codes_of(circuit, trial.cell_siemens, "near", random))
-    estimator = make_estimator("joint", SkinKnowledge(16, 16, adc_bits=10, rest_ratio=rest))
+    knowledge, frames = of_a_board(trial, trial.cell_siemens, 1)
+    estimator = make_estimator("joint", knowledge)
     assert {estimator.estimate(frame).message for frame in frames} == {""}
 
 
 def test_a_fingertip_that_moves_on_16x16_does_not_teach_wires_by_every_frame() -> None:
-    """By a node Laplacian. Frames of one touch err alike: as many lessons, they gave 3.6 %."""
+    """Frames of one touch err alike: as many lessons, they gave 3.6 %."""
     trial = finger_trial(16, 16, 30, 9007)
-    circuit, random = SkinCircuit(trial.rest), np.random.default_rng(7)
-    codes = codes_of(circuit, np.repeat(trial.rest.cell_siemens[None], 60, axis=0), "near", random)
-    rest = ratio_from_codes(codes).mean(axis=0)
-    frames = ratio_from_codes(codes_of(circuit, trial.cell_siemens, "near", random))
-    estimator = make_estimator("joint", SkinKnowledge(16, 16, adc_bits=10, rest_ratio=rest))
+    knowledge, frames = of_a_board(trial, trial.cell_siemens, 7)
+    estimator = make_estimator("joint", knowledge)
     found = np.array([estimator.estimate(frame).cell_siemens for frame in frames])
     assert np.median(np.abs(found / trial.cell_siemens - 1)[trial.pressed]) < 0.03
 
