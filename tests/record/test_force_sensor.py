@@ -468,7 +468,7 @@ def test_a_display_counts_what_is_pressed(tmp_path: Path) -> None:
     assert heads[0] == "1 scans   force 0.50 N   touch nothing yet"
     assert any(head.endswith("N   pressed: (0, 1)") for head in heads)
     assert heads[-1].endswith("N   pressed: none")
-    assert picture()[-2].split() == ["0", "3", "2"]  # of `PRESSES`, until then
+    assert picture()[-1].split() == ["0", "3", "2"]  # of `PRESSES`, until then
 
 
 @contextmanager
