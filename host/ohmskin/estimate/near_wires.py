@@ -165,7 +165,9 @@ class LearnedWires(WireBelief):
         before = self._known.means
         self.take(fit.lesson, replace_last=again or not is_news)
         moved = np.abs(self._known.means - before)[:3]
-        return bool((moved > [LARGE_MOVE_LOG, LARGE_MOVE_LOG, USUAL_LEAD_STD_OHM]).any())
+        moves = moved > [LARGE_MOVE_LOG, LARGE_MOVE_LOG, USUAL_LEAD_STD_OHM]
+        # Under fingertips, more fits take long on large skins, and gain nothing.
+        return bool(moves.any()) and (tip_log is None or not again)
 
     def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
         """One Kalman step.
