@@ -82,8 +82,8 @@ class StayingFaults:
         rise_log: how far the cells of this fit conduct more than at rest, (RC,) [log S].
         """
         if (before := self._rise_log) is not None:
-            moved_log = np.abs(rise_log - before).max()
-            if moved_log < MAX_STEP_LOG or likeness(rise_log, before) > SAME_TOUCH:
+            is_idle = max(rise_log.max(), before.max()) < MAX_STEP_LOG
+            if is_idle or likeness(rise_log, before) > SAME_TOUCH:
                 return
         self._rise_log = rise_log
         shorts, yarns = fit.gains_of_shorts(self._pairs, SHORT_OHM), fit.gains_of_yarns()
