@@ -13,6 +13,7 @@ import pytest
 import ohmskin
 from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
+from ohmskin.cli.board import TERMINAL
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import SkinReader
@@ -219,6 +220,15 @@ def test_a_gap_in_the_log_costs_its_presses_alone(
     done = well(calibrate(run, presses, *BY_OHM))
     assert "held-out error [N], of so many presses, of cells' own curves" in done.out
     assert load_calibration(presses[2]).model.pooled.sum() <= 1
+
+
+def test_in_a_narrow_terminal_held_out_errors_are_hundredths_of_a_newton(
+    run: Run, presses: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TERMINAL, "width", 15)
+    done = well(calibrate(run, presses, *BY_OHM))
+    assert "held-out error [0.01 N] of cells' own curves" in " ".join(done.out.split())
+    assert "(5)" not in done.out
 
 
 def test_bad_recordings(run: Run, presses: tuple[Path, Path, Path], tmp_path: Path) -> None:

@@ -322,6 +322,14 @@ def test_a_cell_at_rest_beside_fingertips_on_16x16_is_not_called_open() -> None:
     assert {estimator.estimate(frame).message for frame in frames} == {""}
 
 
+def test_a_soft_fingertip_that_moves_on_16x16_shorts_no_rows() -> None:
+    """Its frames err alike. Asked as so many touches, nine of them named rows 8 and 9."""
+    trial = finger_trial(16, 16, 50, 503, sigma_cells=(0.9, 1.5))
+    knowledge, frames = of_a_board(trial, trial.cell_siemens, 3)
+    estimator = make_estimator("joint", knowledge)
+    assert {estimator.estimate(frame).message for frame in frames} == {""}
+
+
 def test_a_fingertip_that_moves_on_16x16_does_not_teach_wires_by_every_frame() -> None:
     """Frames of one touch err alike: as many lessons, they gave 3.6 %."""
     trial = finger_trial(16, 16, 30, 9007)

@@ -21,13 +21,7 @@ from ohmskin.doctor.circuit import examine_circuit, examine_leaks
 from ohmskin.doctor.far import examine_far, near_ends
 from ohmskin.doctor.findings import Diagnosis, Kind, Place, Severity, merged
 from ohmskin.doctor.limits import ALL_STDS
-from ohmskin.doctor.signal import (
-    MOVED_LSB,
-    Look,
-    Rest,
-    examine_settling,
-    examine_signal,
-)
+from ohmskin.doctor.signal import MOVED_LSB, Look, Rest, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm

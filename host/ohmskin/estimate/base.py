@@ -32,7 +32,9 @@ TOUCH_STDS: Final = 4.0
 DOUBT_STD: Final = 0.3
 # What `Estimate.wires` says of wires that nobody told, and what people read of that.
 ASSUMED: Final = "assumed"
-ASSUMED_WIRES: Final = "wires not known: touches may be harder; calibrate, or press corners"
+ASSUMED_WIRES: Final = (
+    "wires not known: touches may be harder than shown; calibrate, or press corners"
+)
 
 
 @dataclass(frozen=True, eq=False)
