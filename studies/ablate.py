@@ -42,12 +42,23 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from ohmskin.arrays import Float
-from ohmskin.estimate import full_fit, joint, prior, sparse_fit, staying_faults, wire_belief
+from ohmskin.estimate import (
+    cells_at_rest,
+    full_fit,
+    joint,
+    prior,
+    sparse_fit,
+    staying_faults,
+    wire_belief,
+)
 from studies.ablate_scenes import SCENES, Plan, Sample, observe
 from studies.conditions import Case
 from studies.rows import Progress, as_csv, field_names, in_processes
 
-MODULES: Final = (prior, full_fit, sparse_fit, joint, wire_belief, staying_faults)
+MODULES: Final = (
+    *(prior, full_fit, sparse_fit, joint),
+    *(cells_at_rest, wire_belief, staying_faults),
+)
 # What makes a constant do nothing, or, of a deviation, what is all but certain: 0 would divide.
 OFF: Final[dict[str, float]] = {
     "prior.UNTOUCHED_STD": 10.0,

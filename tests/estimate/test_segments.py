@@ -10,7 +10,7 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
-from ohmskin.estimate import joint
+from ohmskin.estimate import cells_at_rest
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.estimate.methods import make_estimator
@@ -38,7 +38,7 @@ def test_touches_teach_single_segments_of_long_wires(monkeypatch: pytest.MonkeyP
     trials = [random_trial(8, 8, 8, 80, seed, wire_ohm=LONG) for seed in range(3)]
     share, stds_off = np.concatenate([late_errors(trial) for trial in trials], axis=1)
     assert np.mean(stds_off < 4) > 0.98
-    monkeypatch.setattr(joint, "LEARNED_LINE_OHM", np.inf)
+    monkeypatch.setattr(cells_at_rest, "LEARNED_LINE_OHM", np.inf)
     without, _ = np.concatenate([late_errors(trial) for trial in trials], axis=1)
     assert np.median(share) < 0.8 * np.median(without)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ohmskin.estimate import (
+    cells_at_rest,
     far_wires,
     full_fit,
     joint,
@@ -25,7 +26,7 @@ from studies.ablate_scenes import Plan
 TINY = Plan(skins=3, frames=4)
 SCENE = "ngspice_random"
 MODULES = (
-    *(far_wires, full_fit, joint, port_faults, port_noise, prior, sparse_fit),
+    *(cells_at_rest, far_wires, full_fit, joint, port_faults, port_noise, prior, sparse_fit),
     *(staying_faults, wire_belief),
 )
 BY_LABEL = {constant.label: constant for constant in ablate.constants()}
@@ -42,7 +43,11 @@ def test_every_number_is_tried() -> None:
 
 
 def test_numbers_that_moved_out_of_joint_are_tried_still() -> None:
-    assert {"staying_faults.STAYING_SURPRISE", "wire_belief.LARGE_MOVE_LOG"} <= set(BY_LABEL)
+    assert {
+        "cells_at_rest.LEAK_GAIN",
+        "staying_faults.STAYING_SURPRISE",
+        "wire_belief.LARGE_MOVE_LOG",
+    } <= set(BY_LABEL)
 
 
 @pytest.mark.parametrize(

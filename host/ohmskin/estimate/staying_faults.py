@@ -33,6 +33,9 @@ from ohmskin.arrays import Float
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.prior import MAX_STEP_LOG, likeness
 
+# Skins of fewer ports are told no such fault. Chosen: on 3x3, a few odd readings spoil a whole
+# frame.
+LEAST_STAYING_PORTS: Final = 16
 # Resistance of a short [ohm]. Chosen: of two threads that touch. Most shorts of up to some hundred
 # ohm look about the same.
 SHORT_OHM: Final = 20.0
@@ -71,16 +74,21 @@ class StayingFaults:
         self._shorts, self._yarns = np.zeros(len(self._pairs)), np.zeros(sum(self._shape))
         self._rise_log: Float | None = None  # of the last touch that was asked
 
-    def count(self, fit: FullFit, *, is_doubted: bool) -> None:
-        """Count how much this frame surprises the model. is_doubted: its fit is no answer."""
-        surprise = MOST_SURPRISE if is_doubted else min(fit.surprise, MOST_SURPRISE)
-        self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
-
-    def compare(self, fit: FullFit, rise_log: Float) -> None:
-        """Ask a new touch for all damages. A fit that is no answer may show one all the same.
+    def ask(self, fit: FullFit, rise_log: Float, *, is_doubted: bool, knows_rest: bool) -> None:
+        """Count what this frame shows. A fit that is no answer may show a damage all the same.
 
         rise_log: how far the cells of this fit conduct more than at rest, (RC,) [log S].
+        is_doubted: the fit is no answer. knows_rest: wires do not hide the cells at rest.
         """
+        if rise_log.size < LEAST_STAYING_PORTS:
+            return
+        surprise = MOST_SURPRISE if is_doubted else min(fit.surprise, MOST_SURPRISE)
+        self._surprise += SURPRISE_SHARE * (surprise - self._surprise)
+        if knows_rest:
+            self._compare(fit, rise_log)
+
+    def _compare(self, fit: FullFit, rise_log: Float) -> None:
+        """Ask a new touch for all damages."""
         if (before := self._rise_log) is not None:
             is_idle = max(rise_log.max(), before.max()) < MAX_STEP_LOG
             if is_idle or likeness(rise_log, before) > SAME_TOUCH:

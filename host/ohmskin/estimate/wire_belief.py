@@ -241,6 +241,10 @@ class WireBelief(ABC):
         own = SEGMENT_STD**2 * np.eye(2 * self.leads_of_ports.shape[0])
         return np.asarray(block_diag(covariance, own), np.float64)
 
+    def line_ohm(self) -> float:
+        """Resistance of the wire of a row or of a column, whichever is more, end to end [ohm]."""
+        return float((np.exp(self.means[:2]) * self.shape[::-1]).max())
+
     @property
     def learns_segments(self) -> bool:
         """Whether what single segments differ from their means by is in m."""
