@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,6 +134,21 @@ def test_a_finger_that_lies_evenly_on_two_lines_is_in_doubt_and_no_short() -> No
         assert not frame.fault
         doubted.append(frame.doubt[3:5].all())
     assert np.mean(doubted) > 0.5
+
+
+@pytest.mark.parametrize("half", [np.s_[:4], np.s_[:, :4]], ids=["rows", "columns"])
+def test_lines_beside_a_press_on_half_the_skin_are_not_shorted(half: Any) -> None:
+    """It ties the other layer's lines to one node, from which untouched lines draw alike."""
+    faults = []
+    for seed in range(5):
+        rest = skin_at_rest(8, 8, np.random.default_rng(seed))
+        circuit, cells = SkinCircuit(rest), rest.cell_siemens.copy()
+        cells[half] += 2e-4
+        untouched, pressed = (
+            ten_bits(circuit.readings(one)[..., :4]) for one in (rest.cell_siemens, cells)
+        )
+        faults.append(reader_of(untouched).read(pressed).fault)
+    assert faults == [""] * 5
 
 
 def test_a_row_shorted_to_a_column_is_named(rest: Skin, touched: Skin) -> None:

@@ -57,6 +57,10 @@ DRIFT_SHARE: Final = 0.15
 # Two lines are alike if none of their currents differ by more standard deviations. Chosen: joined
 # electrodes give the same code, or differ by noise, and one code is 3.5 deviations of rounding.
 SAME_STDS: Final = 3.4
+# Lines of the other layer are tied to one node if a line's currents from them differ by a smaller
+# share of what they differed by at rest. Chosen: under half a skin it is 0.36 and less; for lines
+# that are shorted and not touched, 0.78 and more.
+TIED_SHARE: Final = 0.5
 # Touched lines are shorted if no frame shows them apart while so many are compared: three seconds
 # at 90 Hz. Chosen: no finger lies so evenly on two lines for longer.
 ALIKE_FRAMES: Final = 270
@@ -159,7 +163,7 @@ class LinePairs:
         self._axis, self._least_std = axis, least_std
         self._lines, self._ports = (rest.current if axis == 0 else rest.current.T).shape
         self._rest_std = self._largest_std(rest)
-        self._rest_apart = self._apart(rest)
+        self._rest_apart, self._rest_differ = self._apart(rest), self._differ(rest)
         self.reset()
 
     def reset(self) -> None:
@@ -214,6 +218,11 @@ class LinePairs:
         # frame, and need not be alike for long. But a touch at one place may be a finger on both.
         since = self._never_apart & (least_places != 1)
         is_shorted = alike & differed & (since | (self._alike_frames >= ALIKE_FRAMES))
+        # Hard touches over many cells tie all lines of the other layer to one node. A line that is
+        # not touched draws the same current from each of them then, that of all its cells, and
+        # sums of cells may be alike.
+        tied = self._differ(now) < TIED_SHARE * self._rest_differ
+        is_shorted &= ~(tied & tied[:, None])
         doubt = alike & (self._never_apart | (self._alike_frames >= DOUBT_FRAMES))
         doubt &= least_places > 0
         in_doubt = np.asarray(doubt.any(axis=0) | doubt.any(axis=1))
@@ -233,6 +242,11 @@ class LinePairs:
         difference = np.abs(current[:, None, :] - current)
         difference /= np.maximum(std[:, None, :], std)
         return np.asarray(difference.max(axis=2))
+
+    def _differ(self, ports: PortCurrents) -> Float:
+        """By how much the currents of each line differ, over their mean, (lines,)."""
+        current = ports.current if self._axis == 0 else ports.current.T
+        return np.asarray(np.ptp(current, axis=1) / np.maximum(current.mean(axis=1), 1e-12))
 
     def _largest_std(self, ports: PortCurrents) -> float:
         return max(float(ports.std.max()), self._least_std)
