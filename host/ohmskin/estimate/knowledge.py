@@ -116,9 +116,9 @@ class WireOhm(NamedTuple):
         """
         if self.both is None:
             return 0.0
-        ohm = np.maximum(self.both, LEAST_WIRE_OHM)
-        square = float(ohm @ [std or 0.0 for std in self[3:5]]) ** 2
-        return square / (square + (LAYER_STD * float(ohm.sum())) ** 2)
+        top, bottom = (max(ohm, LEAST_WIRE_OHM) for ohm in self.both)
+        off_ohm = top * (self.top_log_std or 0.0) + bottom * (self.bottom_log_std or 0.0)
+        return off_ohm**2 / (off_ohm**2 + (LAYER_STD * (top + bottom)) ** 2)
 
     def of_curves(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
         """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
@@ -285,7 +285,8 @@ def check_ratio(
 def _read_of_lines(ratio: Float) -> Bool:
     """Which of the readings (R, C, n) must be there: those of lines and names that were read."""
     is_read = ~np.isnan(ratio)
-    rows, columns, kinds = (np.any(is_read, axis=axes) for axes in ((1, 2), (0, 2), (0, 1)))
+    cells, kinds = np.any(is_read, axis=2), np.any(is_read, axis=(0, 1))
     if not kinds.any():
         return np.ones_like(is_read)
-    return np.asarray(rows[:, None, None] & columns[:, None] & kinds)
+    of_lines = np.any(cells, axis=1)[:, None] & np.any(cells, axis=0)
+    return np.asarray(of_lines[..., None] & kinds)
