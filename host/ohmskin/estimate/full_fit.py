@@ -103,14 +103,17 @@ class FullFit:
         ref_ohm: float,
         ports: PortReadings,
         start: Float,
+        *,
+        holds_wires: bool = False,
     ) -> None:
         """Minimise from these log resistances of the cells, `start` (RC,).
 
         ref_ohm: both references in series [ohm].
+        holds_wires: the means stay as they are believed: only cells are fitted.
         """
         self._prior, self._belief, self._ref_ohm = prior, belief, ref_ohm
         self._current, self._weight = ports.current.ravel(), 1.0 / ports.current_std.ravel()
-        self.iterations, self.message = 0, ""
+        self._holds_wires, self.iterations, self.message = holds_wires, 0, ""
         self.log_cells: Float = start
         self._mean_stds = np.zeros(len(belief.means))  # u of the means
         # The most that a log resistance can have moved since J was made.
@@ -159,7 +162,8 @@ class FullFit:
         self._by_mean = self._weighted(direct) + by_rest
         if wants_noise:
             self._make_noise(by_wires)
-        self._per_mean_std = self._belief.per_mean_std(self._by_mean)
+        moving = np.zeros_like(self._by_mean) if self._holds_wires else self._by_mean
+        self._per_mean_std = self._belief.per_mean_std(moving)
         self._cell_std = np.sqrt(self._variance)
         cells = self._cell_std.size
         self._slopes = slopes = np.empty((cells, cells + self._mean_stds.size))  # J
