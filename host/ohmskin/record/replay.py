@@ -95,19 +95,17 @@ class Replay(Device):
                 case Scan():
                     tare = tare_of(message, tares)
                     rest_ratio = None if tare is None else tare.rest_ratio
-                    self._play_scan(replace(message, rest_ratio=rest_ratio))
+                    with self._changed:
+                        self._stats.scans += 1
+                        self._stats.missed += message.missed
+                        now_s = time.monotonic()
+                        self._publish(replace(message, rest_ratio=rest_ratio, host_time_s=now_s))
                 case Hello():
                     self._check_unit(message)
                     self._hello = message
                 case Tare():
                     tares.append(message)
         raise RecordingEnded(f"{self.name} has been played to its end")
-
-    def _play_scan(self, scan: Scan) -> None:
-        with self._changed:
-            self._stats.scans += 1
-            self._stats.missed += scan.missed
-            self._publish(replace(scan, host_time_s=time.monotonic()))
 
     def _wait_for(self, message: Hello | Scan) -> bool:
         """Wait until somebody reads, and until the message is due. False: the replay was closed."""
