@@ -38,6 +38,7 @@ from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.messages import Scan
 from ohmskin.record.export import FORMATS as OF_READINGS
 from ohmskin.record.export import Part, Stacks, save_readings
+from ohmskin.record.recording import tare_of
 
 FORMATS: Final = (*OF_READINGS, ".parquet")
 # What is told of scans and cells, and of which type it is.
@@ -164,7 +165,7 @@ def _tared(part: Part) -> Iterator[Scan]:
         if unit_id != first_id:
             came = f"unit {unit_id} has come in place of unit {first_id}"
             raise part.error(f"{came}: export each part by its own calibration")
-        tare = part.tare_of(scan)
+        tare = tare_of(scan, part.tares)
         yield scan if tare is None else replace(scan, rest_ratio=tare.rest_ratio)
 
 

@@ -85,7 +85,7 @@ class Part:
     cut_off: whether the recording was not ended properly, so that its last second may be missing.
     boards: what the board had said of itself at the part's first scan, and then at each scan before
         which it said something new.
-    tares: all that were read.
+    tares: all that were read so far.
     marks: those of the part.
     timed, watch: as `messages` takes them.
 
@@ -142,10 +142,6 @@ class Part:
     def _holds(self, after_s: float) -> bool:
         """Whether this is a moment of the part [s after the first scan]."""
         return (self.begin_s or after_s) <= after_s <= (self.end_s or after_s)
-
-    def tare_of(self, scan: Scan) -> Tare | None:
-        """The newest tare so far that is good for this scan; None if there is none."""
-        return tare_of(scan, self.tares)
 
     def error(self, text: str) -> RecordingError:
         """An error whose remedy is to choose a smaller part: `text` ends before those options."""
@@ -205,7 +201,7 @@ def _save_npz(part: Part, out: Path, size: tuple[int, ...], names: tuple[str, ..
                 raise part.error(f"{many}: export a part of them")
             stacks.add({"ratio": _of_names(scan, scan.ratio, names)[None].astype(_RATIO)})
             stacks.add({name: np.array([getattr(scan, name)], _OF_SCAN[name]) for name in _OF_SCAN})
-            tare = part.tare_of(scan)  # now: tares that come after the part are read, too
+            tare = tare_of(scan, part.tares)  # now: tares that come after the part are read, too
         board = part.boards[0]
         more = {
             "reading_names": names,
