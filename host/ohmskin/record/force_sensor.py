@@ -240,23 +240,19 @@ class ForceSensor(Closing):
             raise DeviceLost(f"{self.path} is gone: is the force sensor still plugged in?")
         if time.monotonic() - self._last_s <= SILENCE_TIMEOUT_S:
             return
-        trouble = (
-            f"no force from {self.path} for {SILENCE_TIMEOUT_S:g} s ({self.damaged} damaged lines"
-        )
-        if self.damaged:
-            trouble += f", the last one {self._decoder.last_damaged!r}"
+        last = f", the last one {self._decoder.last_damaged!r}" if self.damaged else ""
+        lines = f"{self.damaged} damaged lines{last}"
+        problem = f"no force from {self.path} for {SILENCE_TIMEOUT_S:g} s ({lines})"
         remedy = (
             f"the force sensor must print one number a line at {self._baud} baud, without being "
             "asked; of several numbers, say the --force-column"
         )
-        raise DeviceLost(f"{trouble})", remedy)
+        raise DeviceLost(problem, remedy)
 
     def _read(self) -> None:
         try:
             while not self._closing:
-                octets = self._link.read()
-                if octets:
-                    self._keep(octets, time.monotonic())
+                self._keep(self._link.read(), time.monotonic())
         except DeviceLost:
             self._is_gone = True
 
