@@ -64,8 +64,7 @@ class Recorder(Closing):
     ) -> None:
         self.path = Path(path)
         self.now_s = now_s
-        self.scans = self.missed = self.forces = 0
-        self.size = 0
+        self.scans = self.missed = self.forces = self.size = 0
         self._readable = 0  # scans that have been written to the file
         self.board = board
         self.tare: Tare | None = None
