@@ -112,9 +112,11 @@ class PortCircuit:
         if to_sense is not None:
             lost = self.impedance @ (near.T @ self._half[:, sum(self.shape) :])
             self.sensed = self.impedance - lost
-            drop = _ends_of_ports(lost, self.rows)
-            self.drop_ohm: Float = np.stack([drop[0], -drop[1]]).reshape(2, -1)
-            port_ohm = port_ohm - self.drop_ohm.sum(axis=0).reshape(self.shape)
+            own, rows = lost.diagonal(), self.rows  # what each line loses of its own current
+            of_rows = own[:rows, None] - lost[rows:, :rows].T
+            of_columns = own[rows:] - lost[:rows, rows:]
+            self.drop_ohm = np.stack([of_rows, of_columns]).reshape(2, -1)
+            port_ohm = port_ohm - (of_rows + of_columns)
         self.port_ohm: Float = port_ohm.ravel()
 
     @cached_property
@@ -199,13 +201,11 @@ class PortCircuit:
         this lowers the voltage at the sensed ends by xs of it: x for a current that flows through
         the sensed ends.
         """
-        x, sensed = (
-            port_difference((each[first] - each[first + 1]).T, self.rows)
-            for each in (self.impedance, self.sensed)
-        )
-        apart = self.impedance[first] - self.impedance[first + 1]
-        z = apart[np.arange(len(first)), first] - apart[np.arange(len(first)), first + 1]
-        return np.asarray(self.port_ohm[:, None] - x * sensed / (z + short_ohm))
+        apart, sensed = (each[first] - each[first + 1] for each in (self.impedance, self.sensed))
+        shorts = np.arange(len(first))
+        z = apart[shorts, first] - apart[shorts, first + 1]
+        x, xs = port_difference(apart.T, self.rows), port_difference(sensed.T, self.rows)
+        return np.asarray(self.port_ohm[:, None] - x * xs / (z + short_ohm))
 
     def by_cell(self) -> Float:
         """Slopes by the log resistance of each cell, (RC, RC) [ohm]."""
@@ -235,9 +235,8 @@ class PortCircuit:
 
     def by_leaks(self) -> Float:
         """Slopes by the leaks of rows, and of columns, (RC, 2) [ohm / S]."""
-        volt, sensed = (
-            port_difference(potential.T, self.rows) for potential in (self.impedance, self.sensed)
-        )
+        volt = port_difference(self.impedance.T, self.rows)
+        sensed = port_difference(self.sensed.T, self.rows)
         return leak_slopes(volt, sensed, self.shape)
 
 
@@ -258,13 +257,3 @@ def leak_slopes(volt: Float, sensed: Float, shape: tuple[int, int]) -> Float:
         ],
         axis=1,
     )
-
-
-def _ends_of_ports(lines: Float, rows: int) -> Float:
-    """What the current of each port causes at its row and at its column, (2, R, C).
-
-    lines[i, j] (R+C, R+C): what a current into line j causes at line i; or transposed. The current
-        of a port flows into its row and out of its column.
-    """
-    at_itself, by_row, by_column = lines.diagonal(), lines[:rows, rows:], lines[rows:, :rows]
-    return np.stack([at_itself[:rows, None] - by_column.T, by_row - at_itself[rows:]])

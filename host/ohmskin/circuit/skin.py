@@ -230,12 +230,10 @@ def leak_admittance(shape: tuple[int, int], leak_siemens: tuple[float, float]) -
     """
     rows, columns = shape
     leaks = np.zeros((rows + columns, rows + columns))
-    for first, lines, leak in (
-        (0, rows, columns * leak_siemens[0]),
-        (rows, columns, rows * leak_siemens[1]),
-    ):
-        chain = np.diff(np.eye(lines), axis=0)  # a row for each pair of neighbours
-        leaks[first : first + lines, first : first + lines] = leak * (chain.T @ chain)
+    of_layers = columns * leak_siemens[0], rows * leak_siemens[1]
+    for layer, leak in zip((leaks[:rows, :rows], leaks[rows:, rows:]), of_layers, strict=True):
+        chain = np.diff(np.eye(len(layer)), axis=0)  # a row for each pair of neighbours
+        layer[:] = leak * (chain.T @ chain)
     return leaks
 
 
