@@ -37,7 +37,7 @@ def test_the_page_is_sent_what_is_known_and_can_command_nothing() -> None:
         client.params = {"token": TOKEN}
         with panel(client) as page:
             state = page.until_state(lambda state: state["kneaded"])
-            assert (state["port"], state["board"]["rows"], state["methods"]) == ("a port", 2, [])
+            assert (state["port"], state["board"]["rows"]) == ("a port", 2)
             show(scan, "press at row 0, column 2")
             seen = page.scan(lambda scan: True)
             np.testing.assert_allclose(seen["log_std"], log_std, rtol=1e-6)

@@ -71,17 +71,13 @@ def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, more: dict[str, Any
     if has_forces:
         planes |= {"force": scan.force_n, "force_std": scan.force_n_std}
     content = more | {
-        "scan": scan.number,
-        "host_time_s": scan.host_time_s,
-        "rows": scan.rows,
-        "columns": scan.columns,
         "chi2": _number(estimate.chi2),
         "estimate_s": estimate.seconds,
         "text": estimate.message,
         "wires": ASSUMED_WIRES if estimate.wires == ASSUMED else "",
         "contacts": [list(map(_number, _numbers_of(contact))) for contact in scan.contacts],
     }
-    return Shown.of(content, planes)
+    return Shown.of(scan, content, planes)
 
 
 def _number(value: float) -> float | None:

@@ -30,7 +30,7 @@ class KneadedBoard:
         self._words, self._status, self._said_s = "", "scanning", -np.inf
 
     def state(self) -> dict[str, Any]:
-        """What the page shows besides the map, as values for JSON."""
+        """What the page shows besides the map, as values for JSON: all else is none."""
         return {
             "port": self.port,
             "status": self._status,
@@ -38,14 +38,6 @@ class KneadedBoard:
             "note": self._words,
             "board": of_board(self._board),
             "kneaded": True,
-            "methods": [],
-            "method": "",
-            "force_method": None,
-            "rest_date": None,
-            "tared": False,
-            "focus": False,
-            "recording": "",
-            "recorded": "",
         }
 
     def show(
@@ -60,25 +52,17 @@ class KneadedBoard:
             return
         self._said_s, self._words = scan.host_time_s, words
         content = {
-            "scan": scan.number,
-            "host_time_s": scan.host_time_s,
-            "rows": scan.rows,
-            "columns": scan.columns,
-            "method": "",
             "missed": 0,
             "rate_hz": self._board.rate_hz,
-            "recorded": 0,
             "chi2": None,
             "estimate_s": 0.0,
-            "text": "",
-            "wires": "",
             "contacts": [["next", *next_cell, None, None]],
         }
         # The page looks for most of these in every scan.
         nothing: Float = np.zeros_like(log_std)
         planes = dict.fromkeys(("raw", "raw_touched", "siemens", "siemens_std"), nothing)
         planes |= {"log_std": log_std, "touched": known.astype(np.float64)}
-        self.shown = Shown.of(content, planes)
+        self.shown = Shown.of(scan, content, planes)
         self._tell()
 
     def end(self, words: str) -> None:

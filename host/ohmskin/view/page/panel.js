@@ -252,14 +252,14 @@ export class Panel {
             (board.mode === "far" ? ", mode far: lines are sensed at both ends" : "")
         : "",
     );
-    options(this.find(".method"), state.methods, state.method, (name) =>
+    options(this.find(".method"), state.methods ?? [], state.method ?? "", (name) =>
       name === state.force_method ? `${name} (calibrated)` : name,
     );
     const recording = this.find(".record");
     recording.textContent = state.recording ? "Stop recording" : "Record";
     recording.setAttribute("aria-pressed", Boolean(state.recording));
     this.element.classList.toggle("recorded", Boolean(state.recording));
-    this.find(".focus").setAttribute("aria-pressed", state.focus);
+    this.find(".focus").setAttribute("aria-pressed", Boolean(state.focus));
     this.enable(true);
     this.sayFile();
     const date = state.rest_date?.slice(0, 19).replace("T", " ");
@@ -289,7 +289,7 @@ export class Panel {
   }
 
   sayFile() {
-    const { recording, recorded } = this.state;
+    const { recording, recorded = "" } = this.state;
     const scans = this.scan?.recorded ?? 0;
     say(
       this.find(".file"),
@@ -307,9 +307,8 @@ export class Panel {
   }
 
   rescale() {
-    const withForce =
-      this.state.force_method !== null && this.state.method === this.state.force_method;
-    const { kneaded } = this.state;
+    const { force_method, kneaded, method } = this.state;
+    const withForce = Boolean(force_method) && method === force_method;
     const there = kneaded
       ? ["known"]
       : ["newtons", "siemens", "ohms"].filter((name) => withForce || name !== "newtons");
