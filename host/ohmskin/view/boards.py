@@ -19,12 +19,12 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.configurations import as_near
 from ohmskin.emulate.urls import is_stepped
 from ohmskin.errors import OhmskinError
-from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES, Estimate
+from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, kind_of, make_estimator
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration
-from ohmskin.force.reader import TARE_S, ForceScan, SkinReader
+from ohmskin.force.reader import TARE_S, SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.live import LiveSkin
@@ -50,34 +50,6 @@ LONGEST_TEXT_CHARS: Final = 1000
 _FOCUS_ENDS_S: Final = 0.5
 # Numbers of a `Contact` that the page shows.
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
-
-
-def _shown(scan: ForceScan, raw: Estimate, has_forces: bool, more: dict[str, Any]) -> Shown:
-    """What the page is sent of a scan.
-
-    raw: what `ohm` makes of the readings at near ends. It has ghosts, and the page shows it beside
-        the scan's own estimate.
-    has_forces: whether the scan's forces are newtons.
-    more: further fields of the header.
-    """
-    estimate = scan.estimate
-    planes: dict[str, Float | Bool] = {
-        "raw": raw.cell_siemens,
-        "raw_touched": raw.touched,
-        "siemens": estimate.cell_siemens,
-        "siemens_std": estimate.cell_siemens_std,
-        "touched": estimate.touched,
-    }
-    if has_forces:
-        planes |= {"force": scan.force_n, "force_std": scan.force_n_std}
-    content = more | {
-        "chi2": _number(estimate.chi2),
-        "estimate_s": estimate.seconds,
-        "text": estimate.message,
-        "wires": ASSUMED_WIRES if estimate.wires == ASSUMED else "",
-        "contacts": [list(map(_number, _numbers_of(contact))) for contact in scan.contacts],
-    }
-    return Shown.of(scan, content, planes)
 
 
 def _number(value: float) -> float | None:
@@ -296,14 +268,30 @@ class ViewedBoard(LiveSkin):
             return
         # The scan is read first: the method of the reader may be another one after that.
         read, running = reader.read(scan), self._running()
-        more = {
+        estimate = read.estimate
+        content = {
             "method": reader.method,
             "missed": device.stats.missed,
             "rate_hz": device.info.rate_hz,
             "recorded": 0 if running is None else running.recorder.scans,
+            "chi2": _number(estimate.chi2),
+            "estimate_s": estimate.seconds,
+            "text": estimate.message,
+            "wires": ASSUMED_WIRES if estimate.wires == ASSUMED else "",
+            "contacts": [list(map(_number, _numbers_of(contact))) for contact in read.contacts],
         }
-        ghosts = self._raw.estimate(as_near(scan.ratio, scan.reading_names))
-        self.shown = _shown(read, ghosts, reader.has_forces, more)
+        # It has ghosts, and the page shows it beside the scan's own estimate.
+        raw = self._raw.estimate(as_near(scan.ratio, scan.reading_names))
+        planes: dict[str, Float | Bool] = {
+            "raw": raw.cell_siemens,
+            "raw_touched": raw.touched,
+            "siemens": estimate.cell_siemens,
+            "siemens_std": estimate.cell_siemens_std,
+            "touched": estimate.touched,
+        }
+        if reader.has_forces:
+            planes |= {"force": read.force_n, "force_std": read.force_n_std}
+        self.shown = Shown.of(read, content, planes)
 
     def _gone(self) -> None:
         self._end_focus()
