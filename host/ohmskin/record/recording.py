@@ -258,7 +258,8 @@ def messages(
     :raises RecordingError: as `load_recording`.
     """
     topics: dict[int, str] = {}  # by the id of their channel
-    has_hello = is_whole = False
+    is_whole = False
+    board: Hello | None = None
     clock: ScanClock | None = None
     try:
         require_file(path)
@@ -277,11 +278,10 @@ def messages(
                     # In memory, texts and lists of zeros take four times the bytes of their JSON.
                     if name != "scan":
                         allowance.spend(3 * len(octets))
-                    if not has_hello and not isinstance(message, Hello):
-                        raise ValueError("no board says hello in it before the first message")
-                    has_hello = True
                     if isinstance(message, Hello):
                         board = message
+                    elif board is None:
+                        raise ValueError("no board says hello in it before the first message")
                     elif timed and isinstance(message, Scan | Mark):
                         log_ns = int.from_bytes(content[_LOG_TIME], "little")
                         clock = clock or ScanClock(log_ns - round(1e9 * message.host_time_s))
@@ -292,7 +292,7 @@ def messages(
                         watch(file.tell())
                     yield message
                 is_whole = opcode == Opcode.FOOTER
-        if not has_hello:
+        if board is None:
             raise ValueError("no recording of a skin, or cut off before a board says hello in it")
         if is_whole:
             yield None
