@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names for the arrays that all rooms pass around, and how a notebook shows one.
+"""Names for the arrays that all rooms pass around, and how JSON and a notebook show one.
 
 Docstrings where arrays are passed say their shapes and units.
 """
 
 from html import escape
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -16,6 +16,11 @@ Bool = NDArray[np.bool_]
 FULL_SCALE_USIEMENS: Final = 200.0
 # Force at which colours end [N]. Chosen: more than a fingertip usually presses.
 FULL_SCALE_N: Final = 10.0
+
+
+def numbers(values: ArrayLike) -> Any:
+    """Values as lists for JSON, with null in place of what is not finite, which JSON cannot say."""
+    return np.where(np.isfinite(values), values, np.array(None)).tolist()
 
 
 def shades(values: Float, full_scale: float) -> Float:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.live import Live
@@ -19,7 +18,7 @@ from rich.text import Text
 from typer import Option
 
 import ohmskin
-from ohmskin.arrays import FULL_SCALE_N, FULL_SCALE_USIEMENS, Float, shades
+from ohmskin.arrays import FULL_SCALE_N, FULL_SCALE_USIEMENS, Float, numbers, shades
 from ohmskin.cli.board import REF_STD, Port, Scans, Seconds, asked_for
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_by_ctrl_c, ends_in_time
@@ -134,11 +133,6 @@ def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan])
             # The reader, such as `head`, has had enough. Python writes what is left when it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return
-
-
-def numbers(values: ArrayLike) -> Any:
-    """Values as lists for JSON, with null in place of what is not finite, which JSON cannot say."""
-    return np.where(np.isfinite(values), values, np.array(None)).tolist()
 
 
 def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:

@@ -10,13 +10,13 @@ import numpy as np
 from typer import Argument, Option
 
 import ohmskin
+from ohmskin.arrays import numbers
 from ohmskin.circuit.configurations import CONFIGURATIONS
 from ohmskin.circuit.plate import load_plate
 from ohmskin.cli.board import Leads, Port, Wires, wires_of
 from ohmskin.cli.doctor import as_object, print_page, terminal
 from ohmskin.cli.doctor_words import line_in_words
 from ohmskin.cli.picture import check_picture, picture
-from ohmskin.cli.stream import numbers
 from ohmskin.cli.terminal import Terminal
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.gather import gather_plate

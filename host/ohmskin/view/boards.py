@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The boards of the page: what a `LiveSkin` reads is shown, recorded and commanded."""
 
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
-from ohmskin.arrays import Bool, Float
+from ohmskin.arrays import Bool, Float, numbers
 from ohmskin.circuit.configurations import as_near
 from ohmskin.emulate.urls import is_stepped
 from ohmskin.errors import OhmskinError
@@ -50,11 +49,6 @@ LONGEST_TEXT_CHARS: Final = 1000
 _FOCUS_ENDS_S: Final = 0.5
 # Numbers of a `Contact` that the page shows.
 _numbers_of: Final = attrgetter("identity", "row", "column", "force_n", "force_n_std")
-
-
-def _number(value: float) -> float | None:
-    """The number, or null in JSON, which has no NaN and no infinity."""
-    return value if math.isfinite(value) else None
 
 
 class _Recording(Closing):
@@ -274,11 +268,11 @@ class ViewedBoard(LiveSkin):
             "missed": device.stats.missed,
             "rate_hz": device.info.rate_hz,
             "recorded": 0 if running is None else running.recorder.scans,
-            "chi2": _number(estimate.chi2),
+            "chi2": numbers(estimate.chi2),
             "estimate_s": estimate.seconds,
             "text": estimate.message,
             "wires": ASSUMED_WIRES if estimate.wires == ASSUMED else "",
-            "contacts": [list(map(_number, _numbers_of(contact))) for contact in read.contacts],
+            "contacts": numbers([_numbers_of(contact) for contact in read.contacts]),
         }
         # It has ghosts, and the page shows it beside the scan's own estimate.
         raw = self._raw.estimate(as_near(scan.ratio, scan.reading_names))
