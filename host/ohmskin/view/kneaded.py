@@ -5,8 +5,6 @@ import threading
 from collections.abc import Callable
 from typing import Any, Final
 
-import numpy as np
-
 from ohmskin.arrays import Bool, Float
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.view.shown import Shown, of_board
@@ -27,14 +25,13 @@ class KneadedBoard:
         self.shown: Shown | None = None
         self.watchers: set[Callable[[], None]] = set()
         self.closing = threading.Event()
-        self._words, self._status, self._said_s = "", "scanning", -np.inf
+        self._words, self._status, self._said_s = "", "scanning", float("-inf")
 
     def state(self) -> dict[str, Any]:
         """What the page shows besides the map, as values for JSON: all else is none."""
         return {
             "port": self.port,
             "status": self._status,
-            "text": "",
             "note": self._words,
             "board": of_board(self._board),
             "kneaded": True,
@@ -51,18 +48,9 @@ class KneadedBoard:
         if scan.host_time_s - self._said_s < _EVERY_S:
             return
         self._said_s, self._words = scan.host_time_s, words
-        content = {
-            "missed": 0,
-            "rate_hz": self._board.rate_hz,
-            "chi2": None,
-            "estimate_s": 0.0,
-            "contacts": [["next", *next_cell, None, None]],
-        }
-        # The page looks for most of these in every scan.
-        nothing: Float = np.zeros_like(log_std)
-        planes = dict.fromkeys(("raw", "raw_touched", "siemens", "siemens_std"), nothing)
-        planes |= {"log_std": log_std, "touched": known.astype(np.float64)}
-        self.shown = Shown.of(scan, content, planes)
+        contacts = [["next", *next_cell, None, None]]
+        planes: dict[str, Float | Bool] = {"log_std": log_std, "touched": known}
+        self.shown = Shown.of(scan, {"contacts": contacts}, planes)
         self._tell()
 
     def end(self, words: str) -> None:

@@ -349,7 +349,7 @@ export class Panel {
     this.dirty = false;
     const cells = scan.rows * scan.columns;
     if (this.chosen === null || this.chosen >= cells) {
-      this.chosen = scan.siemens.indexOf(Math.max(...scan.siemens));
+      this.chosen = scan.siemens?.indexOf(Math.max(...scan.siemens)) ?? 0;
     }
     const scale = this.shownScale();
     const raw = { values: scan.raw, std: null, touched: scan.raw_touched };
@@ -436,16 +436,17 @@ export class Panel {
   }
 
   write(scan, nowMs) {
-    say(this.find(".health"), this.health(scan));
     const count = (touched) => touched.reduce((sum, each) => sum + each, 0);
+    const inWords = this.find(".estimate .count");
+    if (this.state.kneaded) {
+      say(inWords, `${count(scan.touched)} of ${scan.rows * scan.columns} are known, outlined`);
+      this.sayHovered(this.estimate);
+      return; // page.css shows nothing else
+    }
+    say(this.find(".health"), this.health(scan));
     const cells = (number, seem) => `${number} ${number === 1 ? "cell" : "cells"} ${seem}touched`;
     say(this.find(".raw .count"), cells(count(scan.raw_touched), "seemingly "));
-    say(
-      this.find(".estimate .count"),
-      this.state.kneaded
-        ? `${count(scan.touched)} of ${scan.rows * scan.columns} are known, outlined`
-        : `by ‘${scan.method}’: ${cells(count(scan.touched), "")}`,
-    );
+    say(inWords, `by ‘${scan.method}’: ${cells(count(scan.touched), "")}`);
     say(this.find(".chosen"), `${this.place()}, the last ten seconds`);
     say(this.find(".value"), this.value());
     this.find(".plot").setAttribute("aria-label", `Curve of cell ${this.place()} over ten seconds`);
