@@ -36,8 +36,7 @@ from ohmskin.view.shown import Shown, of_board
 LIVE_METHODS: Final = tuple(name for name in METHODS if name not in ("lsq", "regularized"))
 # Modules that boards, estimates and contacts need later: see `load_all`.
 _NEEDED_LATER: Final = (
-    *("ohmskin.emulate.urls", "ohmskin.record.replay"),
-    *("scipy.ndimage", "scipy.optimize", "scipy.sparse.csgraph"),
+    *("ohmskin.record.replay", "scipy.ndimage", "scipy.optimize", "scipy.sparse.csgraph"),
 )
 # A page has at most so many boards. Chosen: each has a thread that may use a good part of a core.
 MOST_BOARDS: Final = 16
