@@ -119,7 +119,10 @@ def open_all(
     ports = [port.path for port in serial_ports() if port.board] if urls is None else list(urls)
     if not ports:
         raise PortError("no skin board found: name ports out of those that 'ohmskin ports' lists")
-    by_unit = None if calibrations is None else _by_unit(calibrations)
+    by_unit: dict[int, Calibration] = {}
+    for calibration in map(loaded, calibrations or ()):
+        if by_unit.setdefault(calibration.unit_id, calibration) is not calibration:
+            raise ValueError(f"two calibrations are of unit {calibration.unit_id}: give one")
     with ExitStack() as opened:
 
         def connect(url: str) -> Device | CalibratedSkin | None:
@@ -129,7 +132,7 @@ def open_all(
                 if searches:
                     return None
                 raise
-            return device if by_unit is None else _calibrated(device, by_unit)
+            return device if calibrations is None else _calibrated(device, by_unit)
 
         # All at the same time, because each takes as long as its board takes to boot.
         with ThreadPoolExecutor(len(ports)) as pool:
@@ -150,11 +153,3 @@ def _calibrated(device: Device, by_unit: dict[int, Calibration]) -> CalibratedSk
         if unit_id not in by_unit:
             raise ValueError(f"no calibration is of its unit, {unit_id}: calibrate this skin")
         return CalibratedSkin(device, by_unit[unit_id])
-
-
-def _by_unit(calibrations: Iterable[CalibrationLike]) -> dict[int, Calibration]:
-    by_unit: dict[int, Calibration] = {}
-    for calibration in map(loaded, calibrations):
-        if by_unit.setdefault(calibration.unit_id, calibration) is not calibration:
-            raise ValueError(f"two calibrations are of unit {calibration.unit_id}: give one")
-    return by_unit
