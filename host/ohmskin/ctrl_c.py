@@ -37,6 +37,18 @@ PATIENCE_S: Final = 0.7
 _AGAIN_S: Final = 0.01
 
 
+class Condition(threading.Condition):
+    """A condition whose lock Ctrl-C never leaves taken.
+
+    ``with`` asks the lock itself here, whose methods are C's: Ctrl-C comes before or after them.
+    Those of `threading.Condition` are Python's. Ctrl-C could come at the end of one, when the lock
+    was taken and the body had not begun, and then other threads waited for the lock forever.
+    """
+
+    __enter__ = property(lambda self: self._lock.__enter__)
+    __exit__ = property(lambda self: self._lock.__exit__)
+
+
 @contextmanager
 def ctrl_c_kept() -> Iterator[None]:
     """Raise what Ctrl-C raises, at the end of the body if not before.

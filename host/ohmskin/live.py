@@ -17,6 +17,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from ohmskin import opening
+from ohmskin.ctrl_c import Condition
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.files import Closing, PathName
 from ohmskin.force.calibration import CalibrationLike, loaded
@@ -95,7 +96,7 @@ class LiveSkin(Closing):
         self._kept: deque[ForceScan] = deque(maxlen=QUEUE_SCANS)
         self._count = 0
         self._sent = 0  # scans so far with those that were missed before them
-        self._changed = threading.Condition()
+        self._changed = Condition()
         # A port that never answers does not hold up the end of the program.
         self._thread = threading.Thread(target=self._work, name=f"live {port}", daemon=True)
         self._thread.start()

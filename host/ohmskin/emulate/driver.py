@@ -15,6 +15,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from io import DEFAULT_BUFFER_SIZE
 
+from ohmskin.ctrl_c import Condition
 from ohmskin.emulate.board import EmulatedBoard
 from ohmskin.emulate.faults import LineFaults
 from ohmskin.emulate.scale import EmulatedScale
@@ -50,7 +51,7 @@ class EmulatorLink(_Running):
     ) -> None:
         super().__init__(board, faults)
         self.name = name
-        self._wake = threading.Condition()
+        self._wake = Condition()
         self._arrived = bytearray()  # what the host has not read yet
         self._closed = False
 

@@ -16,6 +16,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ohmskin.arrays import Float
+from ohmskin.ctrl_c import Condition
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.files import Closing
 from ohmskin.link import protocol
@@ -110,7 +111,7 @@ class Device(Closing):
         self.waits = False
         """Whether scans wait until they are taken: a recording that is played at speed 0."""
         self._stats = stats
-        self._changed = threading.Condition()
+        self._changed = Condition()
         self._hello: Hello | None = None
         self._report: SelfTestReport | None = None  # of the last self-test
         self._failure: OhmskinError | None = None  # why no more scans come

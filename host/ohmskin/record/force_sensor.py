@@ -12,6 +12,7 @@ import time
 from collections import deque
 from typing import Final
 
+from ohmskin.ctrl_c import Condition
 from ohmskin.errors import DeviceLost
 from ohmskin.files import Closing
 from ohmskin.link.device import SILENCE_TIMEOUT_S
@@ -199,7 +200,7 @@ class ForceSensor(Closing):
         self._baud = baud
         self._decoder = ForceLineDecoder(newtons_per_unit, unit, column)
         self._link = SerialLink(path, baud)
-        self._changed = threading.Condition()
+        self._changed = Condition()
         self._waiting: deque[ForceSample] = deque(maxlen=QUEUE_SAMPLES)
         self._last_s = time.monotonic()
         self._closing = self._is_gone = False
