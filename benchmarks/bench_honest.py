@@ -25,6 +25,8 @@ damp    of each mode: neighbouring stripes leak into each other by so many ohm a
 palms   a palm over 60 % of the skin, with peaks of about 250 uS (firm); cells of 200 and 30 kOhm at
         rest (rest_200000, rest_30000). error, p90: of pressed cells, median and 90th percentile.
 large   sound skins of 16x16 cells, of modes near and far; palms, too.
+objects an edge, a ring, something flat on half of the skin or on all of it, of sizes 8x8 and 16x16,
+        of modes near and far.
 damages a segment of ten times its resistance (segment), 20 ohm between two rows (short). named:
         scenes in which a message names these rows. misnamed: scenes in which one names others.
 untold  wires of 150, 500, 1000 and 2000 ohm a segment.
@@ -56,7 +58,9 @@ from studies.judge import STATED_STDS, Verdict, verdict
 from studies.rows import Progress, in_processes
 from studies.trials import (
     NOMINAL_WIRE_OHM,
+    OBJECTS,
     finger_trial,
+    object_trial,
     palm_trial,
     random_trial,
 )
@@ -130,6 +134,8 @@ def trial_of_scene(scene: Scene, frames: int) -> tuple[Skin, Float]:
     """The untouched skin, and the cells of all frames, (F, R, C) [S]."""
     if scene.kind == "random":
         trial = random_trial(*scene.shape, 8, frames, scene.seed, wire_ohm=scene.wire_ohm)
+    elif scene.kind in OBJECTS:
+        trial = object_trial(*scene.shape, frames, scene.seed, scene.kind)
     elif scene.kind == "palms":
         trial = palm_trial(*scene.shape, frames, scene.seed)
     else:
@@ -378,6 +384,21 @@ def of_large(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
     return found
 
 
+def of_objects(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
+    """Sound skins that other things than fingers press, nothing told."""
+    scenes = [
+        skin._replace(name=f"{mode}_{size}x{size}", mode=mode, shape=(size, size))
+        for mode, size in product(("near", "far"), (8, 16))
+        for skin in skins_of(part, seed, OBJECTS, mode=mode)
+        if skin.method == "joint"
+    ]
+    found = Pooled(scenes, jobs, progress)
+    for mode in ("near", "far"):
+        found.bar(at_most, mode, "wrong", 2)
+        found.bar(at_most, mode, "misnamed", 0)
+    return found
+
+
 def of_damages(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
     """A segment of ten times its resistance, and a short of 20 ohm between two rows."""
     scenes = [
@@ -414,6 +435,7 @@ GROUPS: dict[str, Callable[[Part, int, int, Progress], Pooled]] = {
     "damp": of_damp,
     "palms": of_palms,
     "large": of_large,
+    "objects": of_objects,
     "damages": of_damages,
     "untold": of_untold,
 }

@@ -50,6 +50,11 @@ FINGER_SIEMENS: Final = (5e-5, 5e-4)  # least and largest peak of a fingertip. C
 PALM_SHARE: Final = 0.6  # of the cells. Chosen.
 FIRM_SIEMENS: Final = 2.5e-4  # conductance in the middle of a firm palm. Chosen.
 FINGER_FRAMES: Final = 40  # a fingertip's way round its circle. Chosen: it moves in each frame.
+# What else than fingers presses a skin: an edge across it, in any direction; a ring, as of a cup;
+# something flat on half of it, as a book, or on all of it.
+OBJECTS: Final = ("edge", "ring", "half", "whole")
+OBJECT_FRAMES: Final = 6  # for which an object is on the skin. Chosen.
+OBJECT_SIEMENS: Final = (3e-5, 3e-4)  # least and largest peak under an object. Chosen.
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,6 +269,30 @@ def palm_trial(rows: int, columns: int, frames: int, seed: int) -> Trial:
     random = np.random.default_rng(seed)
     rest = skin_at_rest(rows, columns, random)
     return trial_of(rest, palm(rest, frames, random, FIRM_SIEMENS))
+
+
+def object_trial(rows: int, columns: int, frames: int, seed: int, what: str) -> Trial:
+    """One of `OBJECTS`. It comes and goes, at another place each time; cells vary by 20 %."""
+    random = np.random.default_rng(seed)
+    rest, size = skin_at_rest(rows, columns, random), min(rows, columns)
+    row, column = (np.indices(rest.shape).T - np.subtract(rest.shape, 1) / 2).T  # from the middle
+    skins = []
+    for number in range(frames):
+        if number % OBJECT_FRAMES == 0:
+            angle, sigma = random.uniform(0, np.pi), random.uniform(0.5, 0.9)
+            across = row * np.cos(angle) + column * np.sin(angle) - random.uniform(-0.3, 0.3) * size
+            away = {
+                "edge": across,
+                "ring": np.hypot(row, column) - random.uniform(0.25, 0.4) * size,
+                "half": np.maximum(across, 0.0),
+                "whole": np.zeros(rest.shape),
+            }[what]
+            peak = np.exp(random.uniform(*np.log(OBJECT_SIEMENS)))
+            texture = 0.2 * random.standard_normal(rest.shape)
+            rise = peak * np.exp(texture - away**2 / (2 * sigma**2))
+        pressure = np.sin(np.pi * (number % OBJECT_FRAMES + 1) / (OBJECT_FRAMES + 1))
+        skins.append(replace(rest, cell_siemens=rest.cell_siemens + pressure * rise))
+    return trial_of(rest, skins)
 
 
 def finger_trial(
