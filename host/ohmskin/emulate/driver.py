@@ -132,8 +132,7 @@ class SteppedSkin(Session):
 
         :raises DeviceLost: the board went away.
         """
-        with self._changed:
-            self._wait(lambda: False, seconds)
+        self._wait(lambda: False, seconds)
 
     def _begin_thread(self, work: Callable[[], None], name: str) -> None:
         """Nothing reads by itself."""
@@ -141,9 +140,10 @@ class SteppedSkin(Session):
     def _wait(self, ready: Callable[[], bool], limit_s: float) -> bool:
         """See `Device._wait`. Reads meanwhile, because no thread does."""
         end_s = self.now_s + limit_s
-        while not ready() and self._failure is None and self.now_s < end_s:
-            self._run(lambda: self._take_next(end_s - self.now_s))
-        return super()._wait(ready, 0.0)
+        with self._changed:
+            while not ready() and self._failure is None and self.now_s < end_s:
+                self._run(lambda: self._take_next(end_s - self.now_s))
+            return super()._wait(ready, 0.0)
 
     def _take_next(self, limit_s: float) -> None:
         # A step is no longer than a read of a thread would be, because faults are looked for once a

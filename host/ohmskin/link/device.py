@@ -176,10 +176,9 @@ class Device(Closing):
         queue: deque[Scan] = deque()
         with self._changed:  # before the start: on a busy machine, scans may come before it returns
             self._queues[id(queue)] = queue
-        self.start()
-        with self._changed:
             self._asked = True
             self._changed.notify_all()
+        self.start()
         return self._taken(queue)
 
     def _taken(self, queue: deque[Scan]) -> Iterator[Scan]:
@@ -376,10 +375,9 @@ class Device(Closing):
     def _restore(self) -> None:
         """Configure a board again that was reset while it did not scan, and so has forgotten it."""
         for _ in range(COMMAND_TRIES):
-            if self._is_as_wanted() or self._wanted is None:
-                return
-            self._command("configure", **self._wanted)
-            self._refresh()
+            if self._wanted is not None and not self._is_as_wanted():
+                self._command("configure", **self._wanted)
+                self._refresh()
 
     @abstractmethod
     def _command(self, name: str, **values: protocol.Value) -> None:
@@ -448,14 +446,15 @@ class Device(Closing):
             self._changed.notify_all()
 
     def _wait(self, ready: Callable[[], bool], limit_s: float) -> bool:
-        """Wait, holding `_changed`, for `ready()`: whether it is so within `limit_s`.
+        """Wait for `ready()`: whether it is so within `limit_s`.
 
         :raises OhmskinError: the device has failed meanwhile.
         """
-        self._changed.wait_for(lambda: ready() or self._failure is not None, limit_s)
-        if self._failure is not None and not ready():
-            raise self._failure
-        return ready()
+        with self._changed:
+            self._changed.wait_for(lambda: ready() or self._failure is not None, limit_s)
+            if self._failure is not None and not ready():
+                raise self._failure
+            return ready()
 
 
 _CONFIGURE: Final = protocol.FRAMES["configure"]

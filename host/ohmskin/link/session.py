@@ -126,13 +126,12 @@ class Session(Device):
                 self._refresh()
             else:  # the answer shows the line's delays; a board that is just reset gives none
                 sequence = self._send("stop")
-                with self._changed:
-                    self._wait(lambda: sequence in self._acks, _ANSWER_S)
+                self._wait(lambda: sequence in self._acks, _ANSWER_S)
             if baud is not None and baud != self.info.baud:
                 self._command("set_baud", baud=baud)
                 link.set_baud(baud)
-                with self._changed:  # the board changes when its answer has left: be later
-                    self._wait(lambda: False, _SPEED_CHANGE_S)
+                # The board changes when its answer has left: be later.
+                self._wait(lambda: False, _SPEED_CHANGE_S)
                 self._refresh()
         except BaseException:
             self.close()
@@ -146,9 +145,8 @@ class Session(Device):
             self._link.set_baud(protocol.CONSTANTS[speed])
             if asks:
                 self._send("get_hello")
-            with self._changed:
-                if self._wait(lambda: self._hello is not None, listen_s):
-                    return
+            if self._wait(lambda: self._hello is not None, listen_s):
+                return
         speaks = self._decoder.stats.line.octets > 0
         said = "sends bytes that are no frames" if speaks else "is silent"
         remedy = f"is it the skin board's port? Check its cable, and {_FLASH}"
@@ -195,10 +193,9 @@ class Session(Device):
             limit_s = COMMAND_TIMEOUT_S + 1 / self.info.rate_hz
             for _ in range(COMMAND_TRIES):
                 sequence = self._send(name, **values)
-                with self._changed:
-                    if self._wait(lambda: sequence in self._acks, limit_s):  # noqa: B023
-                        ack = self._acks.pop(sequence)
-                        break
+                if self._wait(lambda: sequence in self._acks, limit_s):  # noqa: B023
+                    ack = self._acks.pop(sequence)
+                    break
             else:
                 raise DeviceLost(f"{self.name} does not answer '{name}': unplug and plug it again")
         if ack.result != "ok":
