@@ -370,7 +370,7 @@ class BoardDecoder:
     def __init__(self) -> None:
         self._frames = Decoder()
         # What the board was built from. Its hello says that, and comes first.
-        self._definition = protocol.NOW
+        self.definition = protocol.NOW
         self.stats = BoardStats(line=self._frames.stats)
         # Number of the last scan. -1: none since the command `start`; None: not known.
         self._number: int | None = None
@@ -390,7 +390,7 @@ class BoardDecoder:
         """The message of a frame; None if this host does not know it."""
         if raw.type == protocol.FRAMES["hello"].id:
             return self._hello(raw.payload)
-        frame = self._definition.frames_by_id.get(raw.type)
+        frame = self.definition.frames_by_id.get(raw.type)
         if frame is None or frame.sender != "board":
             return None
         try:
@@ -411,14 +411,14 @@ class BoardDecoder:
         definition = protocol.definition(layout_crc)
         if definition is None or len(payload) != definition.frames["hello"].struct.size:
             return ForeignHello(layout_crc)
-        self._definition = definition
+        self.definition = definition
         hello = Hello(**layouts.today("hello", definition.frames["hello"].unpack(payload)))
         if not hello.scanning:
             self._number = -1  # the next scan is the first since `start`, with the number 0
         return hello
 
     def _scan(self, values: dict[str, Any], packed: bytes, host_time_s: float) -> Scan:
-        codes = _codes(values, packed, self._definition.per_pass)
+        codes = _codes(values, packed, self.definition.per_pass)
         number, dropped = values["scan"], values["dropped"]
         step = 1 if self._number is None else (number - self._number) % _NUMBER_SPAN
         # A step above half of the span is one back: there was a `start` that nobody saw.

@@ -167,8 +167,7 @@ class Session(Device):
 
     def _send(self, name: str, **values: protocol.Value) -> int:
         """Send a command and return its sequence number; nothing waits for the answer."""
-        layout_crc = self._hello.layout_crc if self._hello else protocol.LAYOUT_CRC
-        definition = protocol.definition(layout_crc) or protocol.NOW
+        definition = self._decoder.definition
         taken = layouts.asked(definition, name, values)
         if taken is None:
             raise CommandRefused(name, "unknown_command", f"its firmware is too old: {_FLASH}")
