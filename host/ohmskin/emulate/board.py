@@ -78,9 +78,8 @@ _CONSTANTS: Final = protocol.CONSTANTS
 _PRESCALERS: Final = {name: 32 << n for name, n in protocol.ENUMS["accuracy"].values.items()}
 _REASONS: Final = protocol.ENUMS["result"].docs
 _SCAN: Final = protocol.FRAMES["scan"]
-# Settings that hello says by another name; and all settings that it says.
+# Settings that hello says by another name.
 _ASKED: Final = {"rate_mhz": "rate_asked_mhz", "settle_us": "settle_asked_us"}
-_OF_HELLO: Final = ("unit_id", *(f.name for f in protocol.FRAMES["configure"].fields))
 
 
 @dataclass(frozen=True)
@@ -342,8 +341,7 @@ class EmulatedBoard:
     def _send_hello(self) -> None:
         region, whole = self._next_plans
         truth: dict[str, protocol.Value] = {
-            **{name: self.settings[name] for name in _OF_HELLO if name not in _ASKED},
-            **{said: self.settings[name] for name, said in _ASKED.items()},
+            **{_ASKED.get(name, name): value for name, value in self.settings.items()},
             **_VERSION,
             "layout_crc": protocol.LAYOUT_CRC,
             "board": "emulated",
@@ -380,12 +378,9 @@ def _defaults(settings: BoardSettings) -> dict[str, Any]:
     """The fields of `configure` and `set_unit_id` of a board that nobody has configured."""
     rate_hz = DEFAULT_RATE_HZ if settings.rate_hz is None else settings.rate_hz
     pace = {"rate_mhz": protocol.rate_mhz(rate_hz), "settle_us": 0, "accuracy": "usual"}
-    whole = {"whole_mode": "near", "whole_every": 0}
-    masks = {
-        "row_mask": protocol.all_lines(settings.rows),
-        "column_mask": protocol.all_lines(settings.columns),
-    }
-    defaults = {n: v for n, v in asdict(settings).items() if n != "rate_hz"} | pace | whole | masks
+    whole = protocol.whole_masks(settings.rows, settings.columns)
+    whole |= {"whole_mode": "near", "whole_every": 0}
+    defaults = {n: v for n, v in asdict(settings).items() if n != "rate_hz"} | pace | whole
     baud = _CONSTANTS["baud_default"]
     try:
         _scan_plans(defaults, baud)
@@ -427,13 +422,8 @@ def _scan_plans(wanted: dict[str, Any], baud: int) -> tuple[ScanPlan, ScanPlan]:
     is kept best.
     """
     _check_limits(wanted)
-    whole = {
-        "row_mask": protocol.all_lines(wanted["rows"]),
-        "column_mask": protocol.all_lines(wanted["columns"]),
-        "mode": wanted["whole_mode"],
-        "rate_mhz": 0,
-        "settle_us": 0,
-    }
+    whole = protocol.whole_masks(wanted["rows"], wanted["columns"])
+    whole |= {"mode": wanted["whole_mode"], "rate_mhz": 0, "settle_us": 0}
     return _scan_plan(wanted, baud), _scan_plan(wanted | whole, baud)
 
 

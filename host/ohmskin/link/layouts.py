@@ -30,10 +30,7 @@ def today(frame: str, values: dict[str, Any]) -> dict[str, Any]:
         values["accuracy"] = _ACCURACIES.get(prescaler, prescaler)
     if "row_mask" in values or not {"rows", "columns"} <= values.keys():
         return values
-    masks = {
-        "row_mask": protocol.all_lines(values["rows"]),
-        "column_mask": protocol.all_lines(values["columns"]),
-    }
+    masks = protocol.whole_masks(values["rows"], values["columns"])
     if frame == "scan":
         return {"adc_bits": protocol.ADC_BITS, "slot_cycles": 0} | masks | values
     values.pop("readings_per_cell", None)
@@ -50,11 +47,9 @@ def asked(
     names = [] if frame is None else [field.name for field in frame.fields]
     if frame is None or set(names) == values.keys():
         return None if frame is None else values
-    whole = all(
-        values[mask] == protocol.all_lines(values[lines])
-        for mask, lines in (("row_mask", "rows"), ("column_mask", "columns"))
-    )
-    if not whole or values["whole_every"] or values["mode"] not in definition.modes:
+    whole = protocol.whole_masks(values["rows"], values["columns"])
+    is_whole = whole.items() <= values.items() and not values["whole_every"]
+    if not is_whole or values["mode"] not in definition.modes:
         return None
     of_accuracy = dict(zip(_ACCURACIES.values(), _ACCURACIES, strict=True))
     values = values | {"adc_prescaler": of_accuracy[values["accuracy"]]}

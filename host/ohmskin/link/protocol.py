@@ -30,35 +30,36 @@ _PACKAGE_DIR = Path(__file__).parents[1]
 _IN_PACKAGE = _PACKAGE_DIR / "protocol"
 _IN_CHECKOUT = _PACKAGE_DIR.parents[1] / "protocol"
 _PLACE = _IN_PACKAGE if _IN_PACKAGE.is_dir() else _IN_CHECKOUT
-_STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I"}  # by the names of types in frames.toml
 _TEXT = "text"  # the type whose integers are letters
+# By the names of types in frames.toml.
+_STRUCT_CODES = {"u8": "B", "u16": "H", "u32": "I", _TEXT: "s"}
 
 Value = int | str | tuple[str, ...] | tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class Field:
-    """One integer, or `count` of them, in a payload. All but the last as in ``frames.toml``.
+    """One integer, or `count` of them, in a payload. All but `members` as in ``frames.toml``.
 
     name: of the field.
     type: of an integer: "u8", "u16" or "u32"; "text": of letters, which are bytes.
     doc: what the field means, a sentence.
+    members: the integers of the `Enum` of `enum` or `flags`, by their names; empty without one.
     count: integers in the field.
     enum: the `Enum` one of whose members the integer is; the field's value is that member's name.
     flags: the `Enum` whose members are bits of the integer; the value is a tuple of the names of
         all members whose bit is set.
     unit: of the integer.
-    names: the `Enum` of `enum` or `flags`.
     """
 
     name: str
     type: str
     doc: str
+    members: Mapping[str, int]
     count: int = 1
     enum: str | None = None
     flags: str | None = None
     unit: str | None = None
-    names: "Enum | None" = None
 
     @property
     def span(self) -> int:
@@ -73,9 +74,7 @@ class Field:
     @property
     def code(self) -> str:
         """The field in the words of the module `struct`."""
-        if self.type == _TEXT:
-            return f"{self.count}s"
-        return (str(self.count) if self.count > 1 else "") + _STRUCT_CODES[self.type]
+        return f"{self.count}{_STRUCT_CODES[self.type]}"
 
     def packed(self, value: Value) -> tuple[int | bytes, ...]:
         """What `struct` packs for a value.
@@ -87,13 +86,12 @@ class Field:
             if len(letters) > self.count:
                 raise ValueError(f"{self.name} is {value!r:.40}: {self.count} letters at most")
             return (letters,)
-        if self.enum and self.names and isinstance(value, str):
-            members = self.names.values
-            if value not in members:
-                raise ValueError(f"{self.name}: {value!r} is none of {', '.join(members)}")
-            value = members[value]
-        elif self.flags and self.names and isinstance(value, tuple):
-            value = sum(self.names.values[str(name)] for name in value)
+        if self.enum and isinstance(value, str):
+            if value not in self.members:
+                raise ValueError(f"{self.name}: {value!r} is none of {', '.join(self.members)}")
+            value = self.members[value]
+        elif self.flags and isinstance(value, tuple):
+            value = sum(self.members[str(name)] for name in value)
         given = value if isinstance(value, tuple) else (value,)
         integers = tuple(int(number) for number in given if isinstance(number, int | np.integer))
         if self.count == len(given) == sum(0 <= number < self.span for number in integers):
@@ -111,11 +109,11 @@ class Field:
         if self.type == _TEXT:
             text = unpacked[0].rstrip(b"\0").decode("ascii", "replace")
             return "".join(letter if letter.isprintable() else "?" for letter in text)
-        if self.enum and self.names:
-            names = {value: name for name, value in self.names.values.items()}
+        if self.enum:
+            names = {value: name for name, value in self.members.items()}
             return names.get(unpacked[0], f"unknown_{unpacked[0]}")
-        if self.flags and self.names:
-            return tuple(name for name, bit in self.names.values.items() if unpacked[0] & bit)
+        if self.flags:
+            return tuple(name for name, bit in self.members.items() if unpacked[0] & bit)
         return unpacked if self.count > 1 else int(unpacked[0])
 
 
@@ -154,7 +152,7 @@ class Frame:
         self.fields = tuple(
             Field(
                 **{**field, "count": constants[field["count"]] if "count" in field else 1},
-                names=enums.get(field.get("enum") or field.get("flags") or ""),
+                members=enums[of].values if (of := field.get("enum") or field.get("flags")) else {},
             )
             for field in entry["fields"]
         )
@@ -332,6 +330,11 @@ def pack_codes(codes: NDArray[np.uint16], per_pass: int = 2, bits: int = ADC_BIT
 def all_lines(count: int) -> int:
     """The mask of the first `count` rows or columns, of as many as a mask has bits for."""
     return (1 << min(count, CONSTANTS["rows_max"])) - 1
+
+
+def whole_masks(rows: int, columns: int) -> dict[str, Any]:
+    """The fields `row_mask` and `column_mask` of all of so many rows and columns."""
+    return {"row_mask": all_lines(rows), "column_mask": all_lines(columns)}
 
 
 @lru_cache
