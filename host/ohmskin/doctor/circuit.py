@@ -81,14 +81,14 @@ RATIO_TOLERANCE: Final = 0.03
 class LinesAndCells:
     """What the near ends of a skin show of its lines and cells.
 
-    open_lines: which rows (R,) and which columns (C,) are open.
+    left_out: which rows (R,) and which columns (C,) are open, or are shorted to one before.
     shorts: groups of shorted lines by number; of rows, and of columns.
     touched: which cells are touched, (R, C).
     dead: which cells are dead, (R, C).
     wrong: which cells are dead or saturated, or in an open or a shorted line, (R, C).
     """
 
-    open_lines: tuple[Bool, Bool]
+    left_out: tuple[Bool, Bool]
     shorts: tuple[list[list[int]], list[list[int]]]
     touched: Bool
     dead: Bool
@@ -107,37 +107,36 @@ def examine_circuit(rest: Rest, diagnosis: Diagnosis) -> LinesAndCells:
     usual = float(np.median(current))
     offset_lsb = min(limits.ADC_ERROR_LSB + limits.ROUNDING_LSB, DARK_SHARE * usual)
     dark = current < max(limits.ROUNDING_LSB + DARK_NOISE * rest.noise_lsb, offset_lsb)
-    open_lines, none = (dark.all(axis=1), dark.all(axis=0)), np.zeros_like(dark)
+    left_out, none = (dark.all(axis=1), dark.all(axis=0)), np.zeros_like(dark)
     if dark.all():
         diagnosis.add(Kind.NOTHING_CONDUCTS, one_cell=dark.size == 1)
         diagnosis.measured |= {"reference_ratio": None, "cell_ohm": None}
-        return LinesAndCells(open_lines, ([], []), none, none, dark)
+        return LinesAndCells(left_out, ([], []), none, none, dark)
     for axis, kind in enumerate((Kind.OPEN_ROW, Kind.OPEN_COLUMN)):
-        if open_lines[axis].any():
-            place = Place.of_lines(axis, lines_of(open_lines[axis]))
+        if left_out[axis].any():
+            place = Place.of_lines(axis, lines_of(left_out[axis]))
             counts = {"line_count": dark.shape[axis], "cells_per_line": dark.shape[1 - axis]}
             diagnosis.add(kind, place, **counts)
-    wrong = open_lines[0][:, None] | open_lines[1]
-    siemens, siemens_std = _cells(rest, *open_lines)
+    wrong = left_out[0][:, None] | left_out[1]
+    siemens, siemens_std = _cells(rest, *left_out)
     shorts: tuple[list[list[int]], list[list[int]]] = ([], [])
     if not rest.moves:
         std_lsb = rest.noise_lsb / (4 * rest.scans) ** 0.5
         judged = ~wrong
-        one_of_each = [lines.copy() for lines in open_lines]  # lines that are left out
         for axis, kind in enumerate((Kind.SHORT_ROWS, Kind.SHORT_COLUMNS)):
             for group in _shorted(axis, current, siemens, judged, std_lsb):
                 diagnosis.add(kind, Place.of_lines(axis, group))
                 shorts[axis].append(group)
                 np.moveaxis(wrong, axis, 0)[group] = True
-                one_of_each[axis][group[1:]] = True
+                left_out[axis][group[1:]] = True
         if any(shorts):
             # Shorted lines are one line: with one of them alone, all other cells come out right.
-            siemens, siemens_std = _cells(rest, *one_of_each)
+            siemens, siemens_std = _cells(rest, *left_out)
     touched, dead, saturated = _judge_cells(siemens, siemens_std, ~wrong, rest, diagnosis)
     ratio = _reference_ratio(shown[~dark], rest, diagnosis)
     cell_ohm = 1 / np.nanmedian(siemens)
     diagnosis.measured |= {"reference_ratio": round(ratio, 4), "cell_ohm": float(f"{cell_ohm:.3g}")}
-    return LinesAndCells(open_lines, shorts, touched, dead, wrong | dead | saturated)
+    return LinesAndCells(left_out, shorts, touched, dead, wrong | dead | saturated)
 
 
 def examine_leaks(rest: Rest, diagnosis: Diagnosis) -> None:

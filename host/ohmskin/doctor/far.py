@@ -444,9 +444,8 @@ class _Layer:
         explains = costs[k] < min(self.fit.cost[line] + ALIKE_COST, none_bad_cost - MANY_STDS**2)
         if not explains or more_ohm < CHANGED_SHARE * len(self.across) * self.usual_ohm:
             return False
-        self.fit.ohm[line] = one_bad.ohm[k, line]
-        self.fit.covariance[line] = one_bad.covariance[k, line]
-        self.fit.by_lead[line] = one_bad.by_lead[k, line]
+        for of_lines, of_one_bad in zip(self.fit, one_bad, strict=True):
+            of_lines[line] = of_one_bad[k, line]
         std_ohm = float(one_bad.covariance[k, line, k, k]) ** 0.5
         # Between which lines it is. Before the first one is the electrode, -1.
         between = self.across[k - 1] if k else -1, self.across[candidates[-1]]
@@ -516,12 +515,9 @@ def examine_far(rest: Rest, near: LinesAndCells, diagnosis: Diagnosis) -> None:
     """Add the wires of all lines, and what is wrong with far ends.
 
     rest: readings of mode far. Where no wires are told, lines are compared with each other alone.
-    near: what the near ends show. Open lines are left out, and all but one of shorted lines.
+    near: what the near ends show.
     """
-    kept = []
-    for is_open, shorts in zip(near.open_lines, near.shorts, strict=True):
-        left_out = {*lines_of(is_open), *(n for group in shorts for n in group[1:])}
-        kept.append([n for n in range(len(is_open)) if n not in left_out])
+    kept = [list(lines_of(~left_out)) for left_out in near.left_out]
     skin, expected_lead = FarSkin(rest, kept), rest.lead_ohm
     layers = [_Layer(axis, skin, near.shorts[axis], expected_lead) for axis in (0, 1)]
     wire_ohm: Float = np.zeros((2, *skin.shape))
