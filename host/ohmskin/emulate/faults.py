@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.configurations import DEFAULT_REF_OHM
+from ohmskin.circuit.configurations import DEFAULT_REF_OHM, EXCHANGED
 from ohmskin.circuit.skin import Skin, all_readings, end_admittance, leak_admittance, readings
 from ohmskin.link.protocol import ADC_BITS, ENUMS, MODES, PER_PASS, from_scan_order, in_scan_order
 
@@ -35,8 +35,6 @@ OPEN_OHM: Final = 1e12
 SHORT_SIEMENS: Final = 10.0
 # A stall begins this time after the board's start [s]. Chosen: a host has connected by then.
 _STALL_AFTER_S: Final = 2.0
-# The readings of each sense node: with the top pin high, and with the bottom pin high.
-_NODES: Final = ("ad", "bc", "eh", "fg")
 
 FaultsT = TypeVar("FaultsT")
 Pair = tuple[int, int]
@@ -243,9 +241,9 @@ class SkinFaults:
             names = MODES[mode]
             which = in_scan_order(np.broadcast_to(np.arange(len(names)), ratio.shape), per_pass)
             for k, name in enumerate(names):
-                node = next(node for node in _NODES if name in node)
+                node = next(node for node in EXCHANGED.items() if name in node)
                 # In each slot, the drive sets this node as well, even if another node is read.
-                goals = [names.index(node[other in "cdgh"]) for other in names]
+                goals = [names.index(node[other in EXCHANGED.values()]) for other in names]
                 settled = _settled(in_scan_order(ratio[..., goals]), kept)
                 read = np.where(which == k, settled, read)
         if self.hum:
