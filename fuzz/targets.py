@@ -113,7 +113,7 @@ def frames(octets: bytes) -> None:
                 assert message.codes.size <= MAX_CELLS * protocol.CONSTANTS["readings"]
                 assert len(message.reading_names) == message.codes.shape[2]
             if isinstance(message, Scan) and board is not None:
-                end_us = message.time_us + 1e6 * scan_s(board)
+                end_us = message.time_us + 1e6 * scan_s(board, message)
                 clock.add(end_us, message.host_time_s - line_delay_s(message, board))
                 assert np.isfinite(clock.host_s(end_us))
                 if message.codes.shape[:2] == (board.rows, board.columns):

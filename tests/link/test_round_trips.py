@@ -63,7 +63,7 @@ def test_half_of_the_delays_is_taken_off_the_times_of_scans(
         scans = list(itertools.islice(skin, 200))
         holds = link.sim.drain_hold_log()
         first = holds["cycle"][first_holds(holds)][[scan.number for scan in scans]]
-        middle_s = first / CPU_HZ - BOOT_S + scan_s(skin.info) / 2
+        middle_s = first / CPU_HZ - BOOT_S + scan_s(skin.info, scans[0]) / 2
     for scan in scans:
         assert scan.delay_s == pytest.approx(IN_S, abs=0.3e-3)
     late_s = 1e-9 * np.array([scan.time_ns for scan in scans]) - middle_s

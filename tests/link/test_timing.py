@@ -32,11 +32,11 @@ def test_slots_and_scans_last_as_the_emulated_board_takes_them(
     still = np.full((rows, columns, 4), 0.5)
     settings = BoardSettings(rows, columns, rate_hz=rate_hz)
     skin = stepped(EmulatedBoard(lambda *_: still, settings, sampled=sampled))
-    skin.latest()
+    scan = skin.latest()
     hello = skin.info
     assert slot_s(hello) == slots_s[0]
     last_s = (rows * columns * 4 - 1) * slots_s[0]  # from the scan's first reading to its last
-    assert last_s < scan_s(hello) < (hello.scan_cycles + 1) / hello.clock_hz
+    assert last_s < scan_s(hello, scan) < (hello.scan_cycles + 1) / hello.clock_hz
 
 
 def test_a_picos_bytes_take_as_long_as_its_firmware_reckons() -> None:
@@ -78,7 +78,7 @@ def test_the_line_delay_is_that_of_the_firmware(scan: dict[str, int]) -> None:
                 numbers.append(header["scan"])
                 left_s.append(now_s - step_s / 2)
                 found = Scan(received.codes, header["scan"], header["time_us"], 0.0, 0)
-                modelled_s.append(scan_s(board) + line_delay_s(found, board))
+                modelled_s.append(scan_s(board, found) + line_delay_s(found, board))
                 # Codes with few zeros, and with many.
                 rig.sim.set_table(random.random((16, 16, 4)) ** random.integers(1, 9))
         holds = rig.holds()

@@ -93,13 +93,8 @@ def slot_s(board: Hello) -> float:
     return board.slot_cycles / board.clock_hz
 
 
-def scan_s(board: Hello, scan: Scan | None = None) -> float:
-    """Time from a scan's first reading to its end [s]; idle slots come after that.
-
-    scan: the one that is meant, which may be of a part of the skin; None: one as `board` says.
-    """
-    if scan is None:
-        return board.readings * slot_s(board)
+def scan_s(board: Hello, scan: Scan) -> float:
+    """Time from this scan's first reading to its end [s]; idle slots come after that."""
     return scan.codes_read.size * (scan.slot_cycles or board.slot_cycles) / board.clock_hz
 
 
