@@ -20,7 +20,7 @@ from ohmskin.ctrl_c import Condition
 from ohmskin.errors import DeviceLost, OhmskinError, RecordingEnded
 from ohmskin.files import Closing
 from ohmskin.link import protocol
-from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
+from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport, missing_attribute
 
 if TYPE_CHECKING:
     from asyncio import Future
@@ -131,11 +131,7 @@ class Device(Closing):
     if not TYPE_CHECKING:  # a type checker would take any name for an attribute
 
         def __getattr__(self, name: str) -> object:
-            if name not in ("calibration", "tare", "undo_tare") or hasattr(type(self), name):
-                return super().__getattribute__(name)  # raises, with a property's own error
-            text = f"'{type(self).__name__}' object has no attribute '{name}': skins have it "
-            text += "where a calibration is given: ohmskin.open(port, calibration='skin.json')"
-            raise AttributeError(text, name=name, obj=self)
+            return missing_attribute(self, name, ("calibration", "tare", "undo_tare"), "skins")
 
     @property
     def info(self) -> Hello:

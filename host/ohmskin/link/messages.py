@@ -6,7 +6,7 @@
 a board time that does not wrap.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -189,6 +189,15 @@ class SelfTestReport:
     code_max: tuple[int, ...]
 
 
+def missing_attribute(of: object, name: str, of_calibrated: Collection[str], whose: str) -> Any:
+    """For `__getattr__`: raise as ever, and say of names that calibrated `whose` have why not."""
+    if name not in of_calibrated or hasattr(type(of), name):
+        return object.__getattribute__(of, name)  # raises, with a property's own error
+    text = f"'{type(of).__name__}' object has no attribute '{name}': {whose} have it "
+    text += "where a calibration is given: ohmskin.open(port, calibration='skin.json')"
+    raise AttributeError(text, name=name, obj=of)
+
+
 @dataclass(frozen=True, eq=False)
 class Scan:
     """The readings of a skin, or of a region of it, at one time.
@@ -228,11 +237,7 @@ class Scan:
     if not TYPE_CHECKING:  # a type checker would take any name for an attribute
 
         def __getattr__(self, name: str) -> Any:
-            if name not in _OF_FORCES or hasattr(type(self), name):
-                return super().__getattribute__(name)  # raises, with a property's own error
-            text = f"'{type(self).__name__}' object has no attribute '{name}': scans have it "
-            text += "where a calibration is given: ohmskin.open(port, calibration='skin.json')"
-            raise AttributeError(text, name=name, obj=self)
+            return missing_attribute(self, name, _OF_FORCES, "scans")
 
     def __repr__(self) -> str:
         size = f"{self.rows}x{self.columns} cells, mode {self.mode}"
