@@ -116,7 +116,7 @@ class FarSkin:
         loss = np.stack([a - e, f - b])
         # A loss is the difference of two readings, and the A r that explains it is not exact.
         std = np.hypot(2**0.5 * rest.std_lsb / 2**ADC_BITS, MODEL_STD * loss)
-        silent = []
+        self.silent: list[Bool] = []
         for axis, (near_end, far_end) in enumerate(((a, e), (b, f))):
             moves, follows = (np.ptp(each, axis=1 - axis) for each in (near_end, far_end))
             stays = (follows < moves / CONSTANT_TIMES) & (follows < 2.0**-ADC_BITS)
@@ -126,8 +126,7 @@ class FarSkin:
             whole = ohm.mean() < LEAST_LOSS_OHM - FEW_STDS * std_ohm.mean() / ohm.size**0.5
             # A single line may stay by chance, where the loss of its wires cancels what the cells
             # change. So it counts only if all lines stay.
-            silent.append(stays.all() | (ohm < most_ohm) | whole)
-        self.silent = silent[0], silent[1]
+            self.silent.append(stays.all() | (ohm < most_ohm) | whole)
         floating = np.stack([a - before[..., 1], before[..., 3] - b])
         rows, columns = np.stack([loss, std, floating], axis=1) / self._current
         self.loss_std_floating = rows, columns.swapaxes(1, 2)

@@ -26,15 +26,10 @@ _CRC = struct.Struct("<H")
 # Sequence numbers go on with 0 after so many. An `ack` repeats that of its command, in this field.
 SEQUENCE_SPAN = protocol.FRAMES["ack"].span("command_sequence")
 # Type, sequence, payload and CRC of the largest scan: no frame has more.
-_MAX_CONTENT_BYTES = (
-    _HEADER.size
-    + protocol.FRAMES["scan"].struct.size
-    + protocol.codes_size(
-        math.prod(protocol.CONSTANTS[f"{what}_max"] for what in ("rows", "columns", "readings")),
-        protocol.CONSTANTS["adc_bits_max"],
-    )
-    + _CRC.size
-)
+_MOST_CODES = math.prod(protocol.CONSTANTS[f"{n}_max"] for n in ("rows", "columns", "readings"))
+_MAX_CODES_BYTES = protocol.codes_size(_MOST_CODES, protocol.CONSTANTS["adc_bits_max"])
+_MAX_SCAN_BYTES = protocol.FRAMES["scan"].struct.size + _MAX_CODES_BYTES
+_MAX_CONTENT_BYTES = _HEADER.size + _MAX_SCAN_BYTES + _CRC.size
 # The longest stretch between two delimiters that can be a frame: COBS adds a byte, and one for each
 # block that is full.
 MAX_FRAME_BYTES = _MAX_CONTENT_BYTES + 1 + _MAX_CONTENT_BYTES // (MAX_BLOCK_BYTES - 1)
