@@ -76,7 +76,6 @@ SELECT_CYCLES: Final = 104
 _CONSTANTS: Final = protocol.CONSTANTS
 # Clock cycles of an ADC clock, by accuracy (scan_plan.h).
 _PRESCALERS: Final = {name: 32 << n for name, n in protocol.ENUMS["accuracy"].values.items()}
-_REASONS: Final = protocol.ENUMS["result"].docs
 _SCAN: Final = protocol.FRAMES["scan"]
 # Settings that hello says by another name.
 _ASKED: Final = {"rate_mhz": "rate_asked_mhz", "settle_us": "settle_asked_us"}
@@ -150,15 +149,14 @@ class EmulatedBoard:
         self._next_baud: int | None = None  # it comes when the answer to set_baud has left
         # A scan that was saved at the faster line is kept, and refused at start: as the firmware.
         self._plans = self._next_plans = _scan_plans(self.settings, _CONSTANTS["baud_fast"])
-        self._plan_again()
+        self._started_s: float | None = None
+        self._use(self.settings)
         self._sequence = 0
-        self._rate_mhz = 0  # what the answer to the present command says
         self._scan = 0
         self._cycles = 0  # from the start of scans to that of the one in progress
         self._whole = False  # whether the scan in progress is a whole one
         self._until_whole = 0  # how many scans come before the next whole one
         self._waited = False  # whether that one has let a region go first
-        self._started_s: float | None = None
         self._out = bytearray()
         self._send_hello()
 
@@ -183,7 +181,7 @@ class EmulatedBoard:
         sent, self._out = bytes(self._out), bytearray()
         if self._next_baud is not None:
             self._baud, self._next_baud = self._next_baud, None
-            self._plan_again()
+            self._use(self.settings)
         return sent
 
     def heard(self, faults: LineFaults, now_s: float) -> bytes:
@@ -210,15 +208,16 @@ class EmulatedBoard:
         """Take bytes from the host."""
         for raw in self._decoder.feed(octets):
             frame = protocol.FRAMES_BY_ID.get(raw.type)
-            self._rate_mhz = 0
+            self._rate_mhz = 0  # that can be kept, of the settings that this command asks for
             if frame is None or frame.sender != "host":
                 result = "unknown_command"
             elif len(raw.payload) != frame.struct.size:
                 result = "bad_length"
             else:
                 result = self._execute(frame.name, frame.unpack(raw.payload))
+            asks = frame is not None and frame.name in ("configure", "set_region")
             which = {"command": raw.type, "command_sequence": raw.sequence}
-            told = {"time_us": self._time_us(self.now_s), "rate_mhz": self._rate_mhz}
+            told = {"time_us": self._time_us(self.now_s), "rate_mhz": asks * self._rate_mhz}
             self._send("ack", **which, **told, result=result)
 
     def _execute(self, name: str, values: dict[str, Any]) -> str:
@@ -231,10 +230,10 @@ class EmulatedBoard:
             case "get_hello":
                 self._send_hello()
             case "configure" | "set_region":
-                return self._configure(self.settings | values)
+                return self._use(self.settings | values)
             case "start" if not scanning:
-                if (refusal := self._plan_again()) is not None:
-                    return refusal
+                if (result := self._use(self.settings)) != "ok":
+                    return result
                 self._started_s = self.now_s
                 self._scan = self._cycles = self._until_whole = 0
                 self._take_turn()
@@ -246,8 +245,7 @@ class EmulatedBoard:
             case "save":
                 self._stored = dict(self.settings)
             case "load_defaults":
-                self.settings = dict(self._defaults)
-                self._plans = self._next_plans = _scan_plans(self.settings, self._baud)
+                self._use(dict(self._defaults))
             case "self_test":
                 self._send_self_test_report()
             case "set_baud":
@@ -256,21 +254,11 @@ class EmulatedBoard:
                 self._next_baud = values["baud"]
         return "ok"
 
-    def _plan_again(self) -> str | None:
-        """Plan for the line's speed of now; the reason if the scan is too fast for it.
+    def _use(self, wanted: dict[str, Any]) -> str:
+        """Use these settings from the next scan on, at the line's speed of now.
 
-        Then the plan for the faster line stays.
-        """
-        try:
-            self._plans = self._next_plans = _scan_plans(self.settings, self._baud)
-        except _Refused as refusal:
-            return refusal.result
-        return None
-
-    def _configure(self, wanted: dict[str, Any]) -> str:
-        """Use these settings from the next scan on. If they cannot be, nothing changes.
-
-        Returns the result, "ok" or the reason, by its name in frames.toml.
+        If they cannot be, nothing changes: a plan for the faster line stays. Returns the result,
+        "ok" or the reason, by its name in frames.toml.
         """
         try:
             self._next_plans = _scan_plans(wanted, self._baud)
@@ -278,7 +266,7 @@ class EmulatedBoard:
             self._rate_mhz = refusal.rate_mhz
             return refusal.result
         self.settings = wanted
-        self._rate_mhz = _rate_mhz(self._next_plans[0].cycles)
+        self._rate_mhz = round(1000 * CLOCK_HZ / self._next_plans[0].cycles)
         if self._started_s is None:
             self._plans = self._next_plans
         return "ok"
@@ -381,12 +369,11 @@ def _defaults(settings: BoardSettings) -> dict[str, Any]:
     whole = protocol.whole_masks(settings.rows, settings.columns)
     whole |= {"whole_mode": "near", "whole_every": 0}
     defaults = {n: v for n, v in asdict(settings).items() if n != "rate_hz"} | pace | whole
-    baud = _CONSTANTS["baud_default"]
     try:
-        _scan_plans(defaults, baud)
+        _scan_plans(defaults, _CONSTANTS["baud_default"])
     except _Refused as refusal:
         if settings.rate_hz is not None or refusal.result not in ("too_fast", "line_too_slow"):
-            reason = _REASONS[refusal.result]
+            reason = protocol.ENUMS["result"].docs[refusal.result]
             raise ValueError(f"{refusal.result}: {reason}") from None
         defaults["rate_mhz"] = 0
     return defaults
@@ -409,10 +396,6 @@ class ScanPlan:
     cycles: int
     slot_cycles: int
     settle_us: int
-
-
-def _rate_mhz(cycles: int) -> int:
-    return round(1000 * CLOCK_HZ / cycles)
 
 
 def _scan_plans(wanted: dict[str, Any], baud: int) -> tuple[ScanPlan, ScanPlan]:
