@@ -127,8 +127,7 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
 
 
 def examine(
-    evidence: Evidence,
-    of_scans: Callable[[Evidence, Look, Diagnosis], None] = examine_skin,
+    evidence: Evidence, of_scans: Callable[[Evidence, Look, Diagnosis], None] = examine_skin
 ) -> Diagnosis:
     """All findings, and the figures behind them.
 

@@ -11,15 +11,7 @@ from enum import Enum, auto
 from typing import Any, Final
 
 from ohmskin.doctor.examine import Evidence
-from ohmskin.doctor.signal import (
-    FAR_S,
-    LEAST_SCANS,
-    NOISE_S,
-    REST_S,
-    SETTLED_S,
-    Look,
-    second_look,
-)
+from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, NOISE_S, REST_S, SETTLED_S, Look, second_look
 from ohmskin.doctor.wires import CornerScans
 from ohmskin.errors import CommandRefused, DeviceLost, RecordingEnded
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm

@@ -44,10 +44,7 @@ class EmulatorLink(_Running):
     resets_board = False
 
     def __init__(
-        self,
-        board: EmulatedBoard,
-        name: str = "emulated board",
-        faults: LineFaults | None = None,
+        self, board: EmulatedBoard, name: str = "emulated board", faults: LineFaults | None = None
     ) -> None:
         super().__init__(board, faults)
         self.name = name
