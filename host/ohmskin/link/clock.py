@@ -130,8 +130,7 @@ def line_delay_s(scan: Scan, board: Hello) -> float:
         is_between = board.whole_every and scan.is_whole and scan.mode == board.whole_mode
         period_cycles = board.whole_scan_cycles if is_between else board.scan_cycles
         return period_cycles / board.clock_hz - scan_s(board, scan)
-    masks = (scan.row_mask, scan.rows), (scan.column_mask, scan.columns)
-    header = _header(*(mask or protocol.all_lines(count) for mask, count in masks))
+    header = _header(*scan.masks)
     codes = protocol.pack_codes(scan.codes_read, protocol.PER_PASS[scan.mode], scan.adc_bits)
     # The CRC is not known here. It is taken to have no zeros, which would end a block earlier.
     wire = cobs_encode(header + codes + b"\x01\x01")

@@ -106,8 +106,7 @@ class Hello:
     @property
     def is_complete(self) -> bool:
         """Whether scans are complete: `Scan.is_complete`."""
-        cells = self.row_mask.bit_count() * self.column_mask.bit_count()
-        return cells == self.rows * self.columns and self.readings_per_cell == _COMPLETE_READINGS
+        return self.readings == self.rows * self.columns * _COMPLETE_READINGS
 
     @property
     def readings(self) -> int:
@@ -270,8 +269,7 @@ class Scan:
     @property
     def is_whole(self) -> bool:
         """Whether all cells were read."""
-        all_rows, all_columns = map(protocol.all_lines, (self.rows, self.columns))
-        return self.row_mask in (0, all_rows) and self.column_mask in (0, all_columns)
+        return self.masks == (protocol.all_lines(self.rows), protocol.all_lines(self.columns))
 
     @property
     def is_complete(self) -> bool:
@@ -283,13 +281,15 @@ class Scan:
         """Codes of the rows and columns that were read, shape (their rows, columns, readings)."""
         return self.codes if self.is_whole else self.codes[self._lines()]
 
+    @property
+    def masks(self) -> tuple[int, int]:
+        """Which rows, and which columns, were read; bit 0 is the first."""
+        all_lines = protocol.all_lines
+        return self.row_mask or all_lines(self.rows), self.column_mask or all_lines(self.columns)
+
     def _lines(self) -> tuple[NDArray[Any], ...]:
         """Indices of the rows and columns that were read."""
-        rows, columns = (
-            protocol.lines_of(mask or protocol.all_lines(count), count)
-            for mask, count in ((self.row_mask, self.rows), (self.column_mask, self.columns))
-        )
-        return np.ix_(rows, columns)
+        return np.ix_(*map(protocol.lines_of, self.masks, self.codes.shape))
 
     @property
     def reading_names(self) -> tuple[str, ...]:
