@@ -63,10 +63,10 @@ def header() -> str:
     for name, value in CONSTANTS.items():
         out.append(f"// {DEFINITION['constants'][name]['doc']}")
         out.append(f"constexpr {_c_type(value)} {name.upper()} = {value};")
-    for enum in ENUMS.values():
+    for name, enum in ENUMS.items():
         width = _c_type(max(enum.values.values()))
-        out += ["", f"// {' '.join(DEFINITION['enums'][enum.name]['doc'].split())}"]
-        out.append(f"enum class {_camel(enum.name)} : {width} {{")
+        out += ["", f"// {' '.join(DEFINITION['enums'][name]['doc'].split())}"]
+        out.append(f"enum class {_camel(name)} : {width} {{")
         out += [f"    {_camel(n)} = {v},  // {enum.docs[n]}" for n, v in enum.values.items()]
         out.append("};")
     out += ["", "// Readings of each mode, in scan order: how many, how many a pass, and which."]
@@ -130,17 +130,17 @@ def page() -> str:
             out += ["", "| offset | field | type | unit | meaning |", "|---|---|---|---|---|"]
             out += _rows(frame)
     out += ["", "## Enums"]
-    for enum in ENUMS.values():
+    for name, enum in ENUMS.items():
         out += [
             "",
-            f"### `{enum.name}`",
+            f"### `{name}`",
             "",
-            " ".join(DEFINITION["enums"][enum.name]["doc"].split()) + ".",
+            " ".join(DEFINITION["enums"][name]["doc"].split()) + ".",
             "",
         ]
         out += ["| value | name | meaning |", "|---|---|---|"]
         for n, v in enum.values.items():
-            readings = _passes(n) + ": " if enum.name == "mode" else ""
+            readings = _passes(n) + ": " if name == "mode" else ""
             out.append(f"| {v} | `{n}` | {readings}{enum.docs[n]} |")
     out += ["", "## Constants", "", "| name | value | unit | meaning |", "|---|---|---|---|"]
     for name, entry in DEFINITION["constants"].items():

@@ -121,12 +121,10 @@ class Field:
 class Enum:
     """Names for the values of a field.
 
-    name: of the enum.
     values: the integer of each member, by its name.
     docs: what each member means, by its name.
     """
 
-    name: str
     values: dict[str, int]
     docs: dict[str, str]
 
@@ -204,7 +202,6 @@ class Definition:
         self.constants: dict[str, int] = {k: v["value"] for k, v in content["constants"].items()}
         self.enums = {
             name: Enum(
-                name,
                 {m["name"]: m["value"] for m in enum["members"]},
                 {m["name"]: m["doc"].format(**self.constants) for m in enum["members"]},
             )
