@@ -77,8 +77,6 @@ _CONSTANTS: Final = protocol.CONSTANTS
 # Clock cycles of an ADC clock, by accuracy (scan_plan.h).
 _PRESCALERS: Final = {name: 32 << n for name, n in protocol.ENUMS["accuracy"].values.items()}
 _SCAN: Final = protocol.FRAMES["scan"]
-# Settings that hello says by another name.
-_ASKED: Final = {"rate_mhz": "rate_asked_mhz", "settle_us": "settle_asked_us"}
 
 
 @dataclass(frozen=True)
@@ -329,7 +327,7 @@ class EmulatedBoard:
     def _send_hello(self) -> None:
         region, whole = self._next_plans
         truth: dict[str, protocol.Value] = {
-            **{_ASKED.get(name, name): value for name, value in self.settings.items()},
+            **{protocol.ASKED.get(name, name): value for name, value in self.settings.items()},
             **_VERSION,
             "layout_crc": protocol.LAYOUT_CRC,
             "board": "emulated",

@@ -463,9 +463,8 @@ def _as_said(asked: dict[str, protocol.Value]) -> dict[str, protocol.Value]:
 
 def configuration(board: Hello) -> dict[str, protocol.Value]:
     """The fields of the command `configure` that make a board scan as this one does."""
-    asked = {"rate_mhz": board.rate_asked_mhz, "settle_us": board.settle_asked_us}
-    same = (field.name for field in _CONFIGURE.fields if field.name not in asked)
-    return asked | {name: getattr(board, name) for name in same}
+    names = [field.name for field in _CONFIGURE.fields]
+    return {name: getattr(board, protocol.ASKED.get(name, name)) for name in names}
 
 
 class InThreads(AsyncIterator[_S]):

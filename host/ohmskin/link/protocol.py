@@ -250,6 +250,8 @@ MODES, PER_PASS = NOW.modes, NOW.per_pass
 FRAMES, FRAMES_BY_ID, LAYOUT_CRC = NOW.frames, NOW.frames_by_id, NOW.layout_crc
 _CRC_INITIAL: int = DEFINITION["framing"]["crc_initial"]
 DELIMITER = bytes([DEFINITION["framing"]["delimiter"]])
+# Fields of `configure` that `hello` says by another name.
+ASKED = {"rate_mhz": "rate_asked_mhz", "settle_us": "settle_asked_us"}
 # Bits of a code where nobody says otherwise: those of an AVR's converter, and of emulated boards.
 ADC_BITS = 10
 # The largest code of such a converter, for a voltage of Vdd.
