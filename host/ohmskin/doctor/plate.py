@@ -247,7 +247,7 @@ class PlateExam:
 
     def _examine_lines(self, diagnosis: Diagnosis) -> None:
         """Add configurations whose readings are no straight line over what the circuit predicts."""
-        most = self.tolerance
+        most, bad = self.tolerance, list[str]()
         for k, name in enumerate(CONFIGURATIONS):
             lit = self.predicted_lsb[..., k] > most.offset_lsb  # an offset may clip others
             x, y = self.predicted_lsb[lit, k], self.shown_lsb[lit, k]
@@ -255,13 +255,9 @@ class PlateExam:
                 slope, offset = map(float, np.polyfit(x, y, 1))
                 rest = float(np.abs(y - slope * x - offset).max())
                 self.lines[name] = {"slope": slope, "offset_lsb": offset, "residual_lsb": rest}
-        bad = [
-            name
-            for name, line in self.lines.items()
-            if abs(line["slope"] - 1) > most.slope
-            or abs(line["offset_lsb"]) > most.offset_lsb
-            or line["residual_lsb"] > most.residual_lsb
-        ]
+                is_off = abs(slope - 1) > most.slope or abs(offset) > most.offset_lsb
+                if is_off or rest > most.residual_lsb:
+                    bad.append(name)
         if bad:
             diagnosis.add(Kind.LINEARITY, readings=bad, lines=self.lines, most=most)
 
