@@ -69,7 +69,7 @@ from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_faults import CONSTANT_TIMES, LEAST_LOSS_OHM
 from ohmskin.estimate.prior import SEGMENT_STD
-from ohmskin.link.protocol import ADC_BITS, LARGEST_CODE
+from ohmskin.link.protocol import ADC_BITS, LARGEST_CODE, from_scan_order, in_scan_order
 
 # [1] Segments of a line scatter by this share of their mean. Chosen: twice what estimators expect.
 SPREAD_SHARE: Final = 2 * SEGMENT_STD
@@ -103,10 +103,10 @@ class FarSkin:
     def __init__(self, rest: Rest, kept: list[list[int]]) -> None:
         self.kept = kept
         self._refs, ratio = (rest.board.ref_top_ohm, rest.board.ref_bottom_ohm), rest.ratio
-        # A far node that floats keeps the voltage of the cell that was read before. A scan goes
-        # down one column after the other.
-        before = np.roll(ratio.swapaxes(0, 1).reshape(-1, 4), 1, axis=0)
-        before = before.reshape(ratio.shape[1], -1, 4).swapaxes(0, 1)[np.ix_(*kept)]
+        # A far node that floats keeps the voltage of the cell that was read before: all four
+        # readings of one cell after another, here.
+        cell_later = np.roll(in_scan_order(ratio, 4), 4)
+        before = from_scan_order(cell_later, ratio.shape, 4)[np.ix_(*kept)]
         ratio = ratio[np.ix_(*kept)]
         self.shape = ratio.shape[0], ratio.shape[1]
         near = as_near(ratio, "aebf")
