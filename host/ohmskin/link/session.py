@@ -147,8 +147,7 @@ class Session(Device):
                 self._send("get_hello")
             if self._wait(lambda: self._hello is not None, listen_s):
                 return
-        speaks = self._decoder.stats.line.octets > 0
-        said = "sends bytes that are no frames" if speaks else "is silent"
+        said = "sends bytes that are no frames" if self._stats.line.octets else "is silent"
         remedy = f"is it the skin board's port? Check its cable, and {_FLASH}"
         raise DeviceSilent(f"{self.name} {said}", remedy)
 
