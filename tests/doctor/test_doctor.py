@@ -167,7 +167,7 @@ def test_a_hand_on_most_of_the_skin_is_seen(sound: Evidence) -> None:
     siemens[:5] += 10 ** random.uniform(-5.3, -3.7, (5, 8))
     codes = quantise(readings(replace(skin, cell_siemens=siemens))).astype(np.float64)
     board = replace(sound.board, rows=8, columns=8, row_mask=255, column_mask=255)
-    rest, diagnosis = Rest(board, codes, 50, 0.4, (100.0, 200.0)), Diagnosis()
+    rest, diagnosis = Rest(board, codes, 50, 0.4), Diagnosis()
     touched = examine_circuit(rest, diagnosis).touched
     assert touched[:5].sum() > 30
     assert not touched[5:].any()
@@ -183,7 +183,7 @@ def test_a_converters_gain_is_no_fault_of_unequal_references(sound: Evidence) ->
         exact = 1024 * gain * readings(skin) + 0.7 * random.standard_normal((400, 8, 8, 4))
         codes = np.clip(np.floor(exact), 0, 1023).mean(axis=0)
         diagnosis = Diagnosis()
-        examine_circuit(Rest(board, codes, 400, 0.7, (100.0, 200.0)), diagnosis)
+        examine_circuit(Rest(board, codes, 400, 0.7), diagnosis)
         assert diagnosis.findings == []
 
 
@@ -282,7 +282,7 @@ def test_deviation_of_a_mean_of_codes(sound: Evidence) -> None:
         exact = places[:, None] + before * random.standard_normal((400, 50))
         errors = np.floor(exact).mean(axis=1) + 0.5 - places
         noise = (before**2 + 1 / 12) ** 0.5
-        rest = Rest(sound.board, exact, 50, noise, (100.0, 200.0))
+        rest = Rest(sound.board, exact, 50, noise)
         assert rest.std_lsb == pytest.approx(errors.std(), rel=0.35)
 
 

@@ -93,7 +93,7 @@ def read_of(skin: Skin, noise_lsb: float = 0.0, seed: int = 0) -> Evidence:
 def rest_of(skin: Skin) -> Rest:
     """Of one scan without noise."""
     board, codes = sound(*skin.shape).board, quantise(readings(skin)).astype(np.float64)
-    return Rest(board, codes, 1, EXACT_LSB, NOMINAL, told=TOLD)
+    return Rest(board, codes, 1, EXACT_LSB, told=TOLD)
 
 
 @pytest.mark.parametrize("size", ["2x2", "2x5", "3x3", "4x4", "8x8", "12x4", "16x16"])
@@ -132,15 +132,8 @@ def test_wires_of_circuits_solved_by_ngspice(told: float) -> None:
             exact + 0.3 / 1024 * random.standard_normal((90, 3, 3, 4))
             for exact in (untouched, ratio)
         )
-        nominal = (told * ohm, told * ohm)
-        rest = Rest(
-            sound(3, 3).board,
-            quantise(of_rest).mean(axis=0),
-            90,
-            0.42,
-            nominal,
-            told=WireOhm(lead=0.0),
-        )
+        nominal = WireOhm(told * ohm, told * ohm, lead=0.0)
+        rest = Rest(sound(3, 3).board, quantise(of_rest).mean(axis=0), 90, 0.42, told=nominal)
         _, wires = taken(*of_press).measure(rest)
         assert wires.place == Place(rows=(0,), columns=(0,))
         off = np.log(wires.share * told)

@@ -69,7 +69,7 @@ def diagnosis_of(ratio: Float, noise_lsb: float, lead_ohm: float, scans: int = 2
     board = replace(stepped(FAR).info, rows=rows, columns=columns, **masks)
     seen_lsb = float(np.hypot(noise_lsb, 12**-0.5))
     told = WireOhm(lead=lead_ohm)
-    rest, diagnosis = Rest(board, codes, scans, seen_lsb, (100.0, 200.0), told=told), Diagnosis()
+    rest, diagnosis = Rest(board, codes, scans, seen_lsb, told=told), Diagnosis()
     examine_far(rest, examine_circuit(near_ends(rest), diagnosis), diagnosis)
     return diagnosis
 
@@ -156,7 +156,7 @@ def test_the_firmware_on_a_desk(far_open: int) -> None:
         codes = np.array([scan.codes for scan in rig.scans[2:]], dtype=float)
     board = stepped(FAR).info
     noise_lsb = float(np.sqrt(np.mean(np.diff(codes, axis=0) ** 2) / 2))
-    rest, diagnosis = Rest(board, codes.mean(0), len(codes), noise_lsb, (100.0, 200.0)), Diagnosis()
+    rest, diagnosis = Rest(board, codes.mean(0), len(codes), noise_lsb), Diagnosis()
     examine_far(rest, examine_circuit(near_ends(rest), diagnosis), diagnosis)
     if far_open:
         assert [each.kind for each in diagnosis.findings] == [Kind.OPEN_FAR, Kind.OPEN_FAR]

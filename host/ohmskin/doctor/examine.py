@@ -23,7 +23,6 @@ from ohmskin.doctor.findings import Diagnosis, Kind, Place, Severity, merged
 from ohmskin.doctor.limits import ALL_STDS
 from ohmskin.doctor.signal import MOVED_LSB, Look, Rest, examine_settling, examine_signal
 from ohmskin.doctor.wires import CornerScans
-from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.messages import BoardStats, Hello, Scan, SelfTestReport
 from ohmskin.version import VERSION
@@ -97,12 +96,8 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
             scans = settled
     if presses is not None:
         presses.examine_settling(evidence.pressed, diagnosis)
-    # Unless told otherwise, wires are as those of emulated skins.
     told = evidence.told
-    wire_ohm = told.both or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
-    rest = Rest(
-        scans.board, scans.mean, len(scans.codes), noise_lsb, wire_ohm, moves=moves, told=told
-    )
+    rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, moves=moves, told=told)
     at_near = near_ends(rest) if far else rest
     near = examine_circuit(at_near, diagnosis)
     if far and not moves and not near.wrong.all():
@@ -118,12 +113,12 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
         examine_leaks(at_near, diagnosis)
     if far or touched.any() or near.wrong.any():
         return  # far ends show the wires, or touches and faults hide them
-    diagnosis.nominal_ohm = wire_ohm
+    diagnosis.nominal_ohm = rest.wire_ohm
     if presses is not None:
         diagnosis.pressed = presses.measure(rest)
     for share in diagnosis.pressed or ():
         if share.differs and told.both is not None:  # else nobody says what is nominal
-            diagnosis.add(Kind.WIRES, share.place, share=share, nominal_ohm=wire_ohm)
+            diagnosis.add(Kind.WIRES, share.place, share=share, nominal_ohm=rest.wire_ohm)
 
 
 def examine(

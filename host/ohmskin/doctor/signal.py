@@ -36,6 +36,7 @@ from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.configurations import READING_SIGN, READINGS_PER_CELL
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Kind, Place, lines_of
 from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB, SWITCH_LEAD_STD_OHM
+from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.link.clock import slot_s
@@ -174,7 +175,6 @@ class Rest:
     codes: the means, (R, C, 4) [LSB].
     scans: number of scans that they are means of.
     noise_lsb: noise of a single reading, without hum [LSB].
-    wire_ohm: nominal wires of a segment, top and bottom [ohm].
     moves: something touches the skin and moves, so that the means are those of no one skin.
     offset_lsb: the converter's, where only one polarity is read: a second one cancels it [LSB].
     told: what is told of wires and leads.
@@ -184,10 +184,14 @@ class Rest:
     codes: Float
     scans: int
     noise_lsb: float
-    wire_ohm: tuple[float, float]
     moves: bool = False
     offset_lsb: float = 0.0
     told: WireOhm = NO_WIRES
+
+    @property
+    def wire_ohm(self) -> tuple[float, float]:
+        """Nominal wires of a segment, top and bottom [ohm]; unless told, as of emulated skins."""
+        return self.told.both or (TOP_WIRE_OHM, BOTTOM_WIRE_OHM)
 
     @property
     def lead_ohm(self) -> tuple[float, float]:
