@@ -104,8 +104,7 @@ def gather(
             for clock in ENUMS["accuracy"].values if clocks else ():
                 report(Step.ADC_CLOCK, clock)
                 # As fast as it can: a slow clock does not reach the rate of the board.
-                settings = {"accuracy": clock, "rate_hz": 0}
-                evidence.clocks.append(_look(device, NOISE_S, settings))
+                evidence.clocks.append(_look(device, NOISE_S, {"accuracy": clock, "rate_hz": 0}))
         if presses is not None:
             for scan in scans_for(device, WAIT_S):
                 evidence.presses = presses  # here, because a recording that has ended has none

@@ -440,8 +440,7 @@ def examine_settling(
         place = WHOLE_SKIN if cells.mean() > 0.5 else Place.of_cells(cells)
         change_lsb = float(np.abs(usual.mean - settled.mean).max())
         values = settling_values(usual, settled, change_lsb)
-        limits = {"most_lsb": most_lsb, "mean": mean}
-        diagnosis.add(Kind.SETTLING, place, pressed=False, **limits, **values)
+        diagnosis.add(Kind.SETTLING, place, pressed=False, most_lsb=most_lsb, mean=mean, **values)
     return bool(cells.any())
 
 
