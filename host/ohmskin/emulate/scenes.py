@@ -164,11 +164,8 @@ class Scene:
         self.faults = faults or SkinFaults()
         self.faults.check(rows, columns)
         random = np.random.default_rng(seed)
-
-        def spread(middle: float) -> Float:
-            return middle * np.exp(_SPREAD_SHARE * random.standard_normal((rows, columns)))
-
-        layers = 1 / spread(REST_OHM), spread(TOP_WIRE_OHM), spread(BOTTOM_WIRE_OHM)
+        rest, top, bottom = np.exp(_SPREAD_SHARE * random.standard_normal((3, rows, columns)))
+        layers = 1 / (REST_OHM * rest), TOP_WIRE_OHM * top, BOTTOM_WIRE_OHM * bottom
         self.rest = Skin(*layers, lead_ohm=np.array(LEAD_OHM))
         self._touches = self._place(random)
         # From another generator, so that all that is drawn above stays as it is.
