@@ -127,7 +127,6 @@ class EmulatedBoard:
         self.says = dict(says)
         self._ratio_at = ratio_at
         self._sampled = sampled
-        self._skin_shape = (settings.rows, settings.columns)
         self.on_start: Callable[[float], None] = lambda now_s: None
         self._noise_ratio = noise_lsb / (1 << protocol.ADC_BITS)
         self._random = np.random.default_rng(seed)
@@ -193,8 +192,8 @@ class EmulatedBoard:
         rows, columns = self.settings["rows"], self.settings["columns"]
         mode = mode or self._plan.mode
         ratio = np.tile([float(n in "aceg") for n in protocol.MODES[mode]], (rows, columns, 1))
-        have = (min(rows, self._skin_shape[0]), min(columns, self._skin_shape[1]))
-        ratio[: have[0], : have[1]] = self._ratio_at(time_s, mode)[: have[0], : have[1]]
+        skin = self._ratio_at(time_s, mode)[:rows, :columns]
+        ratio[: skin.shape[0], : skin.shape[1]] = skin
         if self._sampled is not None:
             slot_s = self._plan.slot_cycles / CLOCK_HZ
             ratio = self._sampled(ratio, time_s, slot_s, slot_s - SELECT_CYCLES / CLOCK_HZ, mode)
