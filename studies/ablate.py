@@ -77,7 +77,6 @@ OFF: Final[dict[str, float]] = {
     "prior.REACH_STDS": 1e-3,
     "prior.LEFT_OUT_STDS": 1e-3,
     "prior.CROWDED_SHARE": np.inf,
-    "prior.PALM_SHARE": np.inf,
     "prior.SOFT_CORRELATION": 1.0,
     "sparse_fit.MAX_TOUCHES_PER_LINE": np.inf,
     "sparse_fit.DEMAND_STDS": 0.0,
@@ -86,6 +85,7 @@ OFF: Final[dict[str, float]] = {
     "sparse_fit.HEAVY_SHARE": 0.0,
     "prior.MAX_CHI2": np.inf,
     "joint.LOSS_STDS": 0.0,
+    "joint.PALM_TIMES": np.inf,
 }
 # What is kept of each frame, and the quantile that a figure takes of it; None: the mean.
 FIGURES: Final[dict[str, tuple[str, float | None]]] = {

@@ -6,10 +6,8 @@ import pytest
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin, readings
-from ohmskin.estimate.joint import TELLING_SHARE
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
-    PALM_SHARE,
     UNTOUCHED_STD,
     CellPrior,
     UpperLimits,
@@ -105,23 +103,6 @@ def test_the_level_of_an_untouched_skin_is_found_and_touches_raise_it_little() -
     touched = Skin(cells, skin.top_wire_ohm, skin.bottom_wire_ohm)
     current = readings(touched)[:, :, 1] / skin.ref_bottom_ohm
     assert 1.0 < rest_level(current, 6e4) * 8e5 < 1.5
-
-
-def test_fingertips_are_no_palm() -> None:
-    """On 8x8 cells, a palm over 60 % of them is one; two of the widest fingertips are not."""
-    row, column = np.indices((8, 8))
-    prior = CellPrior(np.full(64, np.log(1e6)), np.full(64, 0.05), np.zeros((64, 3)), np.zeros(3))
-
-    def share(*middles: tuple[float, float]) -> float:
-        tips = (np.exp(-((row - i) ** 2 + (column - j) ** 2) / 2) for i, j in middles)
-        return prior.spread_share(-np.log(1e-6 + 1e-4 * sum(tips)).ravel())
-
-    assert share((3.5, 3.5)) < share((2.0, 2.0), (5.0, 5.0)) < TELLING_SHARE < PALM_SHARE
-    middle = np.abs(row - 3.5) + np.abs(column - 3.5) < 5
-    assert 0.5 < middle.mean() < 0.7
-    of_palm = prior.spread_share(-np.log(1e-6 + 1e-4 * middle).ravel())
-    assert of_palm == pytest.approx(middle.mean(), rel=0.01)
-    assert of_palm > PALM_SHARE
 
 
 def touched(*rows: str) -> tuple[CellPrior, Float, tuple[int, int]]:

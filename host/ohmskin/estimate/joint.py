@@ -38,8 +38,8 @@ from ohmskin.estimate.prior import (
     CLEAR_LOG,
     HIGHEST_TOUCH_SIEMENS,
     MAX_CHI2,
-    PALM_SHARE,
     CellPrior,
+    rest_level,
     siemens_std,
 )
 from ohmskin.estimate.region_fit import Answer, RegionFit, WholeFrame
@@ -53,14 +53,9 @@ LOSS_STDS: Final = 10.0
 # And the frame must show it: by more deviations of its conductance after the fit. Chosen: beside
 # fingertips on 16x16, cells at rest seem to conduct less by up to 3, and open ones by 5 and more.
 SHOWN_STDS: Final = 4.0
-# A frame whose touch is spread over a larger share of the cells tells of no fault that stays.
-# Chosen: two of the widest fingertips have 0.38 of 8x8 cells, and palms that no fit finds had 0.42
-# and more.
-TELLING_SHARE: Final = 0.4
-# A palm that `matrix` cannot explain is spread over a larger share of the cells that it finds.
-# Chosen: firm palms on 16x16, with far ends, are spread over 0.22 and more, and random touches on a
-# skin with a broken yarn over 0.09.
-LOST_PALM_SHARE: Final = 0.15
+# Under a palm, the median port shows cells that conduct so many times as much as at rest. Chosen:
+# up to 4 times under fingertips, and 12 times and more under the lightest palms.
+PALM_TIMES: Final = 10.0
 # A line that resists more than this from end to end is long [ohm]: to find where a fit starts, its
 # wire must not be neglected, and it may hide touches behind it. Chosen: 8 segments of 3 kOhm. From
 # there on, a fit that starts at rest takes fewer steps.
@@ -196,14 +191,15 @@ class JointEstimator(Estimator):
         self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None, *, again: bool
     ) -> tuple[Solution, bool]:
         """`_fitted` of all resistances. Damages, and the belief about the wires, learn from it."""
-        start, is_palm = self._start(prior, ports, touches)
+        level = rest_level(ports.current, self.knowledge.ref_ohm)
+        is_palm = bool(level > PALM_TIMES * np.exp(-prior.expected.mean()))
+        start = prior.expected if is_palm else self._start(prior, ports, touches)
         fit, is_tip = self._fit_all(prior, ports, start, is_palm=is_palm)
         self._touches = prior.touches(fit.log_cells)
         rise_log, message = prior.expected - fit.log_cells, self._doubt(prior, fit)
         if not ports.fault:
             # A palm tells of no damage: that so many cells are pressed is a surprise by itself.
-            is_spread = is_palm or prior.spread_share(fit.log_cells) > TELLING_SHARE
-            if not (again or is_spread):
+            if not (again or is_palm):
                 knows_rest = not self._at_rest.are_hidden
                 self._staying.ask(fit, rise_log, is_doubted=bool(message), knows_rest=knows_rest)
             message = self._staying.named or message or self._staying.unnamed
@@ -225,20 +221,20 @@ class JointEstimator(Estimator):
         Returns whether it has expected fingertips or a palm, too.
         """
         self._belief.before_fit(start, ports)
-        fit_prior = prior
-        if not is_palm:
-            if prior.is_soft(start, self._shape):
-                fit_prior = prior.for_soft_touches()
-            elif not self._knows_wires:
-                fit_prior = prior.for_fingertips(start, self._shape)
-        is_tip = is_palm or fit_prior is not prior
-        self._belief.expect_usual(is_tip or prior.is_crowded(start))
         ref_ohm = self.knowledge.ref_ohm
         if is_palm:
             # On a large skin, cells that conduct less behind shorter wires explain a palm nearly as
             # well. A fit that moves both at once ends there. So cells move first.
+            self._belief.expect_usual(True)
             held = FullFit(prior, self._belief, ref_ohm, ports, start, holds_wires=True)
             start = held.log_cells
+        fit_prior = prior
+        if prior.is_soft(start, self._shape):
+            fit_prior = prior.for_soft_touches()
+        elif not self._knows_wires:
+            fit_prior = prior.for_fingertips(start, self._shape)
+        is_tip = is_palm or fit_prior is not prior
+        self._belief.expect_usual(is_tip or prior.is_crowded(start))
         return FullFit(fit_prior, self._belief, ref_ohm, ports, start), is_tip
 
     def _few_touches(self, prior: CellPrior, ports: PortReadings) -> FewTouches | None:
@@ -355,32 +351,27 @@ class JointEstimator(Estimator):
         """Whether weak cells at the edge of a fingertip cannot pass for wires or for a lead."""
         return self.knowledge.are_wires_sure or all(self._belief.far)
 
-    def _start(
-        self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None
-    ) -> tuple[Float, bool]:
-        """Log resistances of the cells to start from, (RC,), and whether a palm is on the skin.
+    def _start(self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None) -> Float:
+        """Log resistances of the cells to start from, (RC,), if no palm is on the skin.
 
         They are those of the few touches that `SparseFit.find` found, even if
         `FewTouches.explain` rejected these. Where `find` found none, they are what `matrix` finds.
         `matrix` neglects wires, so its cells come out a little too soft. This is wanted: from
         softer cells, the fit does not fall into the wrong minimum of one hard touch behind long
         wires. Where far ends show that wires resist too much to be neglected, the cells start at
-        rest. So they do under a palm.
+        rest.
         """
         if touches is not None:
-            return touches.log_cells, False
+            return touches.log_cells
         if all(self._belief.far) and self._belief.line_ohm() > LONG_LINE_OHM:
-            return prior.expected, False
+            return prior.expected
         # `matrix` may end early: cells that miss each reading by one deviation are a good start.
         tolerance = float(ports.current.size)
         fit = CellFit(ports, self.knowledge.ref_ohm, self._cells_before, tolerance)
         self._cells_before = None if fit.message else fit.best.cell
         siemens = np.minimum(fit.best.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         # No cell starts at more resistance than at rest.
-        log_cells = np.minimum(-np.log(siemens), prior.expected)
-        least_share = PALM_SHARE if fit.best.chi2 <= tolerance else LOST_PALM_SHARE
-        is_palm = prior.spread_share(log_cells) > least_share
-        return prior.expected if is_palm else log_cells, is_palm
+        return np.minimum(-np.log(siemens), prior.expected)
 
 
 class TouchEstimator(JointEstimator):

@@ -73,7 +73,7 @@ from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, Fit, Lesson, WireBelief
 
 # A fingertip is the same as that of the last lesson if both are more alike. Chosen: on 16x16, it
 # has to move by about its width.
-SAME_TIP: Final = 0.5
+SAME_TIP: Final = 0.6
 
 
 class _Filter(NamedTuple):

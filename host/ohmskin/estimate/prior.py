@@ -44,8 +44,6 @@ CROWDED_SHARE: Final = 0.3
 # neighbours than by chance, by so many deviations of a Poisson distribution.
 LEAST_TIP: Final = 3
 CHANCE_STDS: Final = 3.0
-# Under a palm, the touch is spread over a larger share of the cells (`CellPrior.spread_share`).
-PALM_SHARE: Final = 0.45
 # Under soft fingertips, the rises of neighbours in a crowded frame correlate by more.
 SOFT_CORRELATION: Final = 0.5
 
@@ -155,17 +153,6 @@ class CellPrior:
         rise = (self.expected - log_ohm).reshape(shape)
         apart = np.concatenate([np.diff(rise, axis=axis).ravel() for axis in (0, 1)])
         return bool(apart @ apart < 2.0 * (1.0 - SOFT_CORRELATION) * rise.var() * apart.size)
-
-    def spread_share(self, log_ohm: Float) -> float:
-        """Over which share of the cells (RC,) the rise of the conductance is spread.
-
-        The square of the sum of all rises [S] over the sum of their squares is n if n cells rise
-        alike and no other rises. Where rises differ, it is about the number of cells that carry
-        most of the sum.
-        """
-        rise_siemens = np.maximum(np.exp(-log_ohm) - np.exp(-self.expected), 0.0)
-        squares: float = rise_siemens.size * (rise_siemens @ rise_siemens)
-        return float(rise_siemens.sum() ** 2) / max(squares, 1e-30)
 
     def for_soft_touches(self) -> "CellPrior":
         """The prior under soft fingertips, where rest is no more likely than a touch.
