@@ -18,8 +18,9 @@ w              time constant of the pole, or length of the average  s
 Whoever only shifts forces by a lag has them wrong wherever they change faster than w.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Final
 
 import numpy as np
@@ -178,7 +179,8 @@ def fit_scale(
 
     forces = force_n[:, None]
 
-    def misfit(delay_s: float, length_s: float, averages: bool) -> float:
+    def misfit(pair: Sequence[float], averages: bool) -> float:
+        delay_s, length_s = pair
         if delay_s < EARLIEST_S or length_s < 0:
             return np.inf
         shown = Scale(delay_s, length_s, averages).shown(time_s, forces, shown_s)[:, 0]
@@ -190,15 +192,11 @@ def fit_scale(
 
     found = []
     for averages in (False, True):
-        pairs = [(delay_s, length_s) for delay_s in DELAYS_S for length_s in LENGTHS_S]
-        delay_s, length_s = min(pairs, key=lambda pair: misfit(pair[0], pair[1], averages))
+        pairs = product(DELAYS_S, LENGTHS_S)
+        delay_s, length_s = min(pairs, key=lambda pair: misfit(pair, averages))
         corners = [(delay_s, length_s), (delay_s + 0.03, length_s), (delay_s, 1.5 * length_s)]
         options = {"initial_simplex": corners, "xatol": 1e-3, "fatol": 1e-9, "maxfev": 50}
-        best = minimize(
-            lambda pair, averages=averages: misfit(pair[0], pair[1], averages),
-            corners[0],
-            method="Nelder-Mead",
-            options=options,
-        )
-        found.append((best.fun, Scale(float(best.x[0]), float(best.x[1]), averages)))
+        best = minimize(misfit, corners[0], (averages,), "Nelder-Mead", options=options)
+        delay_s, length_s = best.x.tolist()
+        found.append((best.fun, Scale(delay_s, length_s, averages)))
     return min(found, key=lambda one: one[0])[1]

@@ -49,6 +49,7 @@ the leads as told, and the more probable one of both is the answer (`WRONGLY_TOL
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -284,7 +285,8 @@ class _PressFit:
         self._bend = self._x**2 - np.mean(self._x**2)
         level = rest_level(rest_current.reshape(self._shape), self._ref_ohm)
         self._log_siemens = np.full(rest_current.size, np.log(level))
-        self._trials: dict[tuple[float, ...], _Trial] = {}
+        # It keeps more trials than one step and its slopes need.
+        self._trial = lru_cache(maxsize=8)(self._solved)
         self._set_priors(knowledge.nominal_wire_ohm)
         self._set_blocks()
 
@@ -311,17 +313,9 @@ class _PressFit:
 
     # ------------------------------------------------------------------------------ the model
 
-    def _trial(self, wires: Float) -> _Trial:
+    def _solved(self, log_top: float, log_bottom: float, leads: float) -> _Trial:
         """The skin with these wires, p[:3]."""
-        key = tuple(wires.tolist())
-        if key not in self._trials:
-            if len(self._trials) > 8:  # more than one step and its slopes need
-                self._trials.clear()
-            top_ohm, bottom_ohm = np.exp(wires[:2]).tolist()
-            self._trials[key] = self._solved(top_ohm, bottom_ohm, float(wires[2]))
-        return self._trials[key]
-
-    def _solved(self, top_ohm: float, bottom_ohm: float, leads: float) -> _Trial:
+        top_ohm, bottom_ohm = np.exp([log_top, log_bottom]).tolist()
         series_ohm = self._ref_ohm + 2 * leads * UNKNOWN_LEAD_OHM
         log_siemens = self._log_siemens
         for _ in range(_REST_STEPS):
@@ -344,15 +338,13 @@ class _PressFit:
         of_lead = (SEGMENT_STD * leads * UNKNOWN_LEAD_OHM) ** 2
         top[:, 0] += of_lead
         bottom[0] += of_lead
-        path_variance = wire_coupling_ohm(top, bottom, self._shape)[
-            np.ix_(self._cells, self._cells)
-        ]
+        of_path = wire_coupling_ohm(top, bottom, self._shape)[np.ix_(self._cells, self._cells)]
         cells = self._rows.cells
-        at_port = net.port_ohm[cells], net.own_slope[cells], net.cell_volt[cells, cells]
-        return _Trial(at_port[0] + series_ohm, *at_port[1:], path_variance)
+        rest_ohm = net.port_ohm[cells] + series_ohm
+        return _Trial(rest_ohm, net.own_slope[cells], net.cell_volt[cells, cells], of_path)
 
     def _expected(self, p: Float) -> _Expected:
-        trial = self._trial(p[:3])
+        trial = self._trial(*p[:3].tolist())
         log_contact = p[3] + p[4] * self._x + p[5] * self._bend
         rest_current = 1.0 / trial.rest_ohm
 
