@@ -47,13 +47,6 @@ class Lines(NamedTuple):
     rows: range
     columns: range
 
-    def holds(self, other: "Lines") -> bool:
-        """Whether all cells of the other region are in this one."""
-        return all(
-            mine.start <= others.start and others.stop <= mine.stop
-            for mine, others in zip(self, other, strict=True)
-        )
-
 
 class Focus(Closing):
     """Tells a board where to read next, scan after scan, until it is closed.
@@ -148,11 +141,12 @@ def wanted_lines(touched: Bool, before: Lines | None) -> Lines | None:
     least = Lines(rows, columns)
     if len(rows) * len(columns) > MOST_SHARE * touched.size:
         return None
-    if before is not None and before.holds(least):
-        spare = (len(mine) - len(needed) for mine, needed in zip(before, least, strict=True))
-        if max(spare) <= SPARE:
-            return before
-    return least
+    before = before or least
+    stays = (
+        {*needed} <= {*now} and len(now) <= len(needed) + SPARE
+        for now, needed in zip(before, least, strict=True)
+    )
+    return before if all(stays) else least
 
 
 def _around(touched: Bool) -> range:

@@ -363,7 +363,17 @@ class SkinReader:
             # The rise takes the place of the force in sums and centres of contacts.
             of_contacts = np.maximum(rises, 0.0), stds
         of_scans = zip(scans, estimates, *forces, found(touched, *of_contacts), strict=True)
-        return [self._shown(*of_scan, geometry) for of_scan in of_scans]
+        shown = []
+        for scan, estimate, force_n, force_n_std, unnumbered in of_scans:
+            contacts = self._tracker.follow(scan.time_us, unnumbered)
+            if geometry is not None:
+                contacts = tuple(geometry.placed(contact, force_n) for contact in contacts)
+            if (focus := self.focus) is not None:  # another thread may end it
+                focus.follow(estimate.touched, len(contacts), scan)
+            forces_n = {"force_n": force_n, "force_n_std": force_n_std}
+            others = {"contacts": contacts, "estimate": estimate, "geometry": geometry}
+            shown.append(ForceScan(**vars(scan) | forces_n | others))
+        return shown
 
     def _estimated(self, scan: Scan, method: str) -> tuple[Estimate, Float, Float]:
         """The estimate by this method, its rise above rest, and the rise's deviation, (R, C)."""
@@ -384,29 +394,6 @@ class SkinReader:
         if calibration is not None:
             level, level_std = calibration.level(estimate)
         return estimate, np.asarray(level - at_rest), level_std
-
-    def _shown(
-        self,
-        scan: Scan,
-        estimate: Estimate,
-        force_n: Float,
-        force_n_std: Float,
-        unnumbered: list[Contact],
-        geometry: Geometry | None,
-    ) -> ForceScan:
-        contacts = self._tracker.follow(scan.time_us, unnumbered)
-        if geometry is not None:
-            contacts = tuple(geometry.placed(contact, force_n) for contact in contacts)
-        if (focus := self.focus) is not None:
-            focus.follow(estimate.touched, len(contacts), scan)
-        shown: dict[str, object] = {
-            "force_n": force_n,
-            "force_n_std": force_n_std,
-            "contacts": contacts,
-            "estimate": estimate,
-            "geometry": geometry,
-        }
-        return ForceScan(**(vars(scan) | shown))
 
     def _begin(self) -> None:
         """Begin with no contact, and as if no scan had come before."""
