@@ -291,26 +291,22 @@ class Calibrator:
         progress: passes scans on, one after another. Raises ValueError and TareRefused as
         `measure`.
         """
-        if self.shows_wires:
-            return self.measure(scans, progress)
-        return self._history(make_estimator(WIRELESS, self.knowledge), progress(scans))
+        by = self.estimator if self.shows_wires else make_estimator(WIRELESS, self.knowledge)
+        return self.measure(scans, progress, by)
 
-    def measure(self, scans: list[Scan], progress: Progress = iter) -> LevelHistory:
-        """What all scans show above rest. progress: as for `look`.
+    def measure(
+        self, scans: list[Scan], progress: Progress = iter, by: Estimator | None = None
+    ) -> LevelHistory:
+        """What all scans show above rest. progress: as for `look`. by: None: the estimator.
 
         Raises ValueError for scans of another size than the untouched skin, and TareRefused where
         it was touched.
         """
-        return self._history(self.estimator, progress(scans))
-
-    def _history(self, estimator: Estimator, scans: Iterable[Scan]) -> LevelHistory:
+        estimator = by or self.estimator
         rest = estimator.rest_level()
-        levels, read = [], []
-        for scan in scans:
-            answer = estimator.estimate(scan.ratio)
-            levels.append((answer.level - rest, answer.level_std, answer.touched))
-            read.append(scan)
-        history = LevelHistory(scan_times_s(read), *map(np.array, zip(*levels, strict=True)))
+        answers = (estimator.estimate(scan.ratio) for scan in progress(scans))
+        levels = [(answer.level - rest, answer.level_std, answer.touched) for answer in answers]
+        history = LevelHistory(scan_times_s(scans), *map(np.array, zip(*levels, strict=True)))
         # Single cells are pressed, so each cell is untouched in most scans, and its median rise is
         # about 0. If it is far below, something that touched the cell at rest has gone since.
         rise, std = np.median(history.rise, axis=0), np.median(history.rise_std, axis=0)

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from ohmskin.link.messages import Hello
-from ohmskin.record.recording import ForceSample, Recording
+from ohmskin.record.recording import Recording
 
 # So much time is taken to pass between two recordings [s]. Chosen: longer than any gap across which
 # forces or clocks are interpolated.
@@ -82,7 +82,9 @@ def joined(recordings: list[Recording]) -> list[Recording]:
             replace(s, host_time_s=s.host_time_s + later_s, time_us=s.time_us + later_us)
             for s in given.scans
         ]
-        zero_n = _zero_n(given.forces, given.tares[0].host_time_s)
+        at_rest_s = given.tares[0].host_time_s
+        zeros_n = [f.force_n for f in given.forces if f.host_time_s <= at_rest_s]
+        zero_n = float(np.median(zeros_n or [0.0]))
         forces = [
             replace(f, force_n=f.force_n - zero_n, host_time_s=f.host_time_s + later_s)
             for f in {f.host_time_s: f for f in given.forces}.values()
@@ -91,9 +93,3 @@ def joined(recordings: list[Recording]) -> list[Recording]:
         whole.append(replace(given, scans=scans, forces=forces))
         end_s, end_us = scans[-1].host_time_s, scans[-1].time_us
     return whole
-
-
-def _zero_n(forces: list[ForceSample], until_s: float) -> float:
-    """What the sensor shows until then [N]; 0 where it shows nothing."""
-    shown = [sample.force_n for sample in forces if sample.host_time_s <= until_s]
-    return float(np.median(shown)) if shown else 0.0

@@ -66,7 +66,6 @@ is off by r with r^2 = s1^2 sum(P^2). The s1 of this equation is the `residual_s
 """
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -448,13 +447,10 @@ class TotalFit:
     @property
     def left_out(self) -> list[tuple[float, float]]:
         """From when to when a press, or force where nothing is pressed, was left out [s]."""
-        spans: list[tuple[float, float]] = []
-        time_s, out = self._totals.time_s, self._out[self._of_scan]
-        edges = np.flatnonzero(np.diff(np.where(out, self._of_scan, -1), prepend=-1, append=-1))
-        for first, end in pairwise(edges.tolist()):
-            if out[first]:
-                spans.append((float(time_s[first]), float(time_s[end - 1])))
-        return spans
+        time_s, out = self._totals.time_s, np.flatnonzero(self._out)
+        first = np.searchsorted(self._of_scan, out)
+        last = np.searchsorted(self._of_scan, out, "right") - 1
+        return list(zip(time_s[first].tolist(), time_s[last].tolist(), strict=True))
 
     def gain_std(self) -> Float:
         """Standard deviation of the log of each cell's gain, (C,)."""
