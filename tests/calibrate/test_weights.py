@@ -184,7 +184,7 @@ def test_readings_of_before_a_reset_are_not_kept_for_a_press() -> None:
     guided(
         SimpleNamespace(latest=latest, put=None),
         SimpleNamespace(estimator=SimpleNamespace(estimate=estimate), rest_level=np.zeros((1, 2))),
-        SimpleNamespace(recorded=iter, add=lambda step, rest, window: kept.extend(window)),
+        SimpleNamespace(add=lambda step, rest, window: kept.extend(window)),
         [Press((0, 1), 1.0)],
         1,
     )

@@ -2,7 +2,7 @@
 """Leads a person who puts known weights on a skin, on cell after cell or anywhere."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -105,10 +105,6 @@ class KeptPresses:
             self.ratios = self.ratios[wanted]
         self._save()
 
-    def recorded(self, scans: Iterable[Scan]) -> Iterable[Scan]:
-        """Pass scans on. None is kept but those of presses, which `add` gets."""
-        return scans
-
     def _save(self) -> None:
         if not self.table.size:
             self.path.unlink(missing_ok=True)
@@ -145,13 +141,13 @@ def _rows_of(table: PressTable, keys: dict[str, Float], count: int) -> list[int]
 
 
 class KeptAnywhere:
-    """Records all scans while weights are put anywhere, and the force of each that was read.
+    """Keeps weights that are put anywhere, in a recording of all scans meanwhile.
 
     Every weight that was read is a mark: its force.
     """
 
     def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
+        self.recorder = recorder
 
     def add(self, step: Step, _: Float, window: Iterable[Scan]) -> None:
         """Keep the press of a step which has read it from these scans."""
@@ -159,14 +155,8 @@ class KeptAnywhere:
         force_n = step.wanted.force_n
         # Scans that came in one read have the same time, of which there is one force.
         for time_s in sorted({scan.host_time_s for scan in window}):
-            self._recorder.add(ForceSample(force_n, time_s, source=WEIGHTS))
-        self._recorder.add(Mark(repr(force_n), self._recorder.now_s()))
-
-    def recorded(self, scans: Iterable[Scan]) -> Iterator[Scan]:
-        """Pass scans on that are recorded."""
-        for scan in scans:
-            self._recorder.add(scan)
-            yield scan
+            self.recorder.add(ForceSample(force_n, time_s, source=WEIGHTS))
+        self.recorder.add(Mark(repr(force_n), self.recorder.now_s()))
 
 
 def put_anywhere(recordings: Iterable[Recording]) -> list[Press]:
@@ -194,7 +184,9 @@ def guided(
     bar = Progress(*columns, console=TERMINAL, transient=True, disable=not TERMINAL.is_terminal)
     task = bar.add_task("", total=total)
     with bar:
-        for scan in until_ctrl_c(kept.recorded(iter(skin.latest, None))):
+        for scan in until_ctrl_c(iter(skin.latest, None)):
+            if isinstance(kept, KeptAnywhere):
+                kept.recorder.add(scan)
             frame = calibrator.estimator.estimate(scan.ratio)
             rise, touched = frame.level - rest, frame.touched
             if anywhere:
