@@ -26,6 +26,7 @@ delay inside the force sensor, such as that of its filter, is part of the offset
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -139,12 +140,10 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, Bool]:
     grid_s = np.arange(int(span_s / GRID_STEP_S) + 1) * GRID_STEP_S
     level = between_gaps(grid_s, time_s - time_s[0], compressed)
     is_level = np.isfinite(level)
+    blurred = partial(gaussian_filter1d, sigma=SMOOTHING_S / GRID_STEP_S, mode="constant")
     # Gaps are left out of the Gaussian's weights: nothing is made up inside them.
-    weighted_sum, weight_sum = (
-        gaussian_filter1d(on_grid, SMOOTHING_S / GRID_STEP_S, mode="constant")
-        for on_grid in (np.where(is_level, level, 0.0), is_level.astype(np.float64))
-    )
-    smooth = weighted_sum / np.where(is_level, weight_sum, 1.0)
+    weight = np.where(is_level, blurred(is_level.astype(np.float64)), 1.0)
+    smooth = blurred(np.where(is_level, level, 0.0)) / weight
     inside = binary_erosion(is_level, np.ones(3))  # a difference needs both neighbours
     return np.where(inside, np.gradient(smooth, GRID_STEP_S), 0.0), inside
 

@@ -97,12 +97,8 @@ def smoothness(force_n: Float, log_rise: Float, shape: tuple[int, int]) -> Smoot
     near = np.arange(-REACH, REACH + 1)
     down, right = (one.ravel() for one in np.meshgrid(near, near, indexing="ij"))
     place = np.stack([np.ones(down.size), down, right, down**2, down * right, right**2], axis=-1)
-    row, column = (
-        middle[:, None] + off
-        for middle, off in zip(
-            np.unravel_index(force_n.argmax(axis=1), shape), (down, right), strict=True
-        )
-    )
+    hardest_row, hardest_column = np.unravel_index(force_n.argmax(axis=1), shape)
+    row, column = hardest_row[:, None] + down, hardest_column[:, None] + right
     is_inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
     cell = np.where(is_inside, row * shape[1] + column, 0)
     share = np.take_along_axis(force_n, cell, 1) / force_n.max(axis=1, keepdims=True)

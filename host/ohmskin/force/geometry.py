@@ -107,10 +107,9 @@ class Geometry:
         """The contact with its position, sum F_e p_e / sum F_e, and its normal. force_n: (R, C)."""
         share = np.where(contact.cells, np.nan_to_num(force_n), 0.0)
         share = share if share.sum() > 0 else contact.cells.astype(float)
-        position_m, normal = (
-            np.tensordot(share / share.sum(), of_cells, 2)
-            for of_cells in (self.position_m, self.normal)
-        )
+        share = share / share.sum()
+        position_m = np.tensordot(share, self.position_m, 2)
+        normal = np.tensordot(share, self.normal, 2)
         # Normals of a contact that reaches round a thin finger may cancel.
         normal /= np.linalg.norm(normal) or 1.0
         return replace(contact, position_m=position_m, normal=normal)
