@@ -425,11 +425,9 @@ class _PressFit:
 
     def _slopes(self, p: Float, whitener: "_Whitener") -> Float:
         """Of the residual, by differences: a step as small as p may be would show rounding."""
-        here = self._residual(p, whitener)
-        steps = _DIFFERENCE * np.eye(p.size)
-        return (
-            np.column_stack([self._residual(p + h, whitener) - here for h in steps]) / _DIFFERENCE
-        )
+        from scipy.optimize import approx_fprime
+
+        return np.asarray(approx_fprime(p, self._residual, _DIFFERENCE, whitener))
 
     def _scatter(self, p: Float, scatter: Float) -> tuple[Float, float]:
         """The scatter (5,) of most likelihood at p, and -2 log of that likelihood."""
