@@ -45,6 +45,7 @@ types and shapes before anything is made of them, and their ranges when the obje
 """
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Final, Self
@@ -165,11 +166,8 @@ class Calibration:
         if not 0 <= self.unit_id < UNIT_IDS:
             raise ValueError(f"unit_id is {self.unit_id}, not in 0..{UNIT_IDS - 1}")
         _check_date(self.date)
-        if self.method not in LEVEL_METHODS:
-            methods = ", ".join(LEVEL_METHODS)
-            raise ValueError(f"method is {self.method[:40]!r}, not one of {methods}")
-        if self.mode not in MODES:
-            raise ValueError(f"mode is {self.mode[:40]!r}, not one of {', '.join(MODES)}")
+        _require_one_of("method", self.method, LEVEL_METHODS)
+        _require_one_of("mode", self.mode, MODES)
         shape = self.model.kind.shape
         for name, rest in (("rest", self.rest), ("tare", self.tare)):
             if rest is not None and rest.level.shape != shape:
@@ -306,6 +304,11 @@ def _check_date(date: str) -> None:
         raise ValueError(f"date is {date[:40]!r}, not ISO 8601") from None
 
 
+def _require_one_of(name: str, value: str, names: Collection[str]) -> None:
+    if value not in names:
+        raise ValueError(f"{name} is {value[:40]!r}, not one of {', '.join(names)}")
+
+
 CalibrationLike = Calibration | PathName
 
 
@@ -389,8 +392,7 @@ def _rest(name: str, content: Any, shape: tuple[int, ...]) -> Rest:
 def _geometry(content: Any, rows: int, columns: int) -> Geometry:
     said = _value("geometry", content, dict)
     kind = _value("geometry.kind", said.get("kind"), str)
-    if kind not in KINDS:
-        raise ValueError(f"geometry.kind is {kind[:40]!r}, not one of {', '.join(KINDS)}")
+    _require_one_of("geometry.kind", kind, KINDS)
     _require_fields(said, {"kind", "frame_id", *KINDS[kind]}, "geometry.")
     shapes = {"pitch_m": (2,), "radius_m": ()}
     told = {n: _array(n, said[n], shapes.get(n, (rows, columns, 3))) for n in KINDS[kind]}
