@@ -25,14 +25,7 @@ from ohmskin.calibrate.sessions import beside, check_same, joined, session_paths
 from ohmskin.calibrate.tables import ForceLog, load_force_log, load_press_table
 from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
 from ohmskin.cli.knead import kneaded
-from ohmskin.cli.record import (
-    TRUTH,
-    ForceBaud,
-    ForceColumn,
-    ForceScale,
-    ForceUnit,
-    progress,
-)
+from ohmskin.cli.record import TRUTH, ForceBaud, ForceColumn, ForceScale, ForceUnit, progress
 from ohmskin.cli.scale import grams_of, scale
 from ohmskin.cli.stream import cell_table
 from ohmskin.cli.weights import (
@@ -117,8 +110,7 @@ def weights(
         raise ValueError(
             "say --indenter-mm2, or --anywhere without --indenter-mm2, --cells, --redo"
         )
-    told = wires_of(wires, leads)
-    calibrator_of = _options(out, method, indenter_mm2, told, force, table=not anywhere)
+    calibrator_of = _options(out, method, indenter_mm2, wires, leads, force, table=not anywhere)
     forces_n = [mass_g * NEWTONS["g"] for mass_g in grams_of(grams)]
     if anywhere:
         _weigh_anywhere(port, out, np.repeat(forces_n, repeats or 20), calibrator_of)
@@ -224,8 +216,8 @@ def recording(
         raise ValueError("say either --indenter-mm2, of presses of single cells, or --total")
     if as_json and not total:
         raise ValueError("--json is for --total")
-    told = wires_of(wires, leads)
-    calibrator_of = _options(out, method, indenter_mm2, told, force, recording, forces)
+    inputs = recording, forces
+    calibrator_of = _options(out, method, indenter_mm2, wires, leads, force, *inputs)
     given = load_recording(recording)
     log = None if forces is None else load_force_log(forces, any_zero=total)
     with naming(recording):
@@ -286,7 +278,7 @@ def knead(
 
     Ctrl-C ends it with what there is. The same command goes on: all recordings beside OUT count.
     """
-    calibrator_of = _options(out, method, None, wires_of(wires, leads), force)
+    calibrator_of = _options(out, method, None, wires, leads, force)
     said = force_port, force_baud, force_scale, force_unit, force_column
     given, known = kneaded(port, out, said, seconds, view=view)
     try:
@@ -392,8 +384,7 @@ def table(
     force: Force = False,
 ) -> None:
     """From a table of presses (conductance in siemens), and the untouched skin at PORT."""
-    told = wires_of(wires, leads)
-    calibrator_of = _options(out, method, indenter_mm2, told, force, table, table=True)
+    calibrator_of = _options(out, method, indenter_mm2, wires, leads, force, table, table=True)
     rows = load_press_table(table)
     with ohmskin.open(port) as skin:
         calibrator = calibrator_of(skin.info, skin.mean_ratio(rest_s))
@@ -435,7 +426,8 @@ def _options(
     out: Path,
     method: str,
     indenter_mm2: float | None,
-    wires: WireOhm,
+    wires: str,
+    leads: float | None,
     force: bool,
     *inputs: Path | None,
     table: bool = False,
@@ -446,6 +438,7 @@ def _options(
     table: whether presses are in a table.
     Returns a function that makes the calibrator.
     """
+    told = wires_of(wires, leads)
     if method not in LEVEL_METHODS:
         raise ValueError(f"no method '{method}': there are {', '.join(LEVEL_METHODS)}")
     if table and method == VOLTAGE:
@@ -454,7 +447,7 @@ def _options(
         raise ValueError(f"--indenter-mm2 is {indenter_mm2:g}, it must be above 0")
     check_place(out, *inputs, ending=".json")
     area_m2 = None if indenter_mm2 is None else 1e-6 * indenter_mm2
-    return lambda board, rest: Calibrator(board, rest, method, area_m2, wires, force)
+    return lambda board, rest: Calibrator(board, rest, method, area_m2, told, force)
 
 
 def _rest_ratio(given: Recording, rest_s: float) -> Float:
