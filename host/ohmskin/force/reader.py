@@ -294,7 +294,7 @@ class SkinReader:
             calibrated.
         """
         rest_ratio = device.mean_ratio(seconds)
-        self.check_mode(device.info.mode)
+        check_mode(self.board, device.info.mode)
         return replace(self.tare(rest_ratio, force=force), host_time_s=device.now_s)
 
     def undo_tare(self) -> Tare | None:
@@ -324,14 +324,6 @@ class SkinReader:
             raise ValueError(f"'{self._wanted}' takes whole scans, and focus reads parts: {remedy}")
         return Focus(device, like)
 
-    def check_mode(self, mode: str) -> None:
-        """Raise ValueError if the board now scans in a mode that the estimator cannot read.
-
-        Several modes read near ends. A rest of one of these is good for all of them.
-        """
-        if mode != self.board.mode and not is_near((*MODES[mode], *MODES[self.board.mode])):
-            raise ValueError(f"the board scanned in mode {self.board.mode}, now in {mode}")
-
     def read(self, scan: Scan) -> ForceScan:
         """What a scan shows.
 
@@ -350,9 +342,9 @@ class SkinReader:
         scans: one or more. Raises what `read` does.
         """
         method = self._wanted
-        estimated = [self._estimated(scan, method) for scan in scans]
-        estimates = [estimate for estimate, _, _ in estimated]
-        rises, stds = (np.array([each[k] for each in estimated]) for k in (1, 2))
+        estimated = (self._estimated(scan, method) for scan in scans)
+        estimates, *of_levels = zip(*estimated, strict=True)
+        rises, stds = map(np.array, of_levels)
         touched = np.array([estimate.touched for estimate in estimates])
         calibration, geometry = self._shared.calibration, None
         if calibration is not None and self.has_forces:
@@ -377,7 +369,7 @@ class SkinReader:
 
     def _estimated(self, scan: Scan, method: str) -> tuple[Estimate, Float, Float]:
         """The estimate by this method, its rise above rest, and the rise's deviation, (R, C)."""
-        self.check_mode(scan.mode)
+        check_mode(self.board, scan.mode)
         if (scan.rows, scan.columns) != (self.board.rows, self.board.columns):
             sizes = f"{self.board.rows}x{self.board.columns} cells, now {scan.rows}x{scan.columns}"
             raise ValueError(f"the board scanned {sizes}: configure it as before, or open it again")
@@ -528,6 +520,15 @@ class CalibratedSkin(Closing):
                 self._focus.close()
         finally:
             self.device.close()
+
+
+def check_mode(board: Hello, mode: str) -> None:
+    """Raise ValueError if this board now scans in a mode that its estimator cannot read.
+
+    Several modes read near ends. A rest of one of these is good for all of them.
+    """
+    if mode != board.mode and not is_near((*MODES[mode], *MODES[board.mode])):
+        raise ValueError(f"the board scanned in mode {board.mode}, now in {mode}")
 
 
 def _layer_std(estimator: Estimator) -> float:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from ohmskin.errors import OhmskinError
 from ohmskin.files import PathName, naming, save_table, whole_file
 from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
-from ohmskin.force.reader import ForceScan, SkinReader
+from ohmskin.force.reader import ForceScan, SkinReader, check_mode
 from ohmskin.link.messages import Scan
 from ohmskin.record.export import FORMATS as OF_READINGS
 from ohmskin.record.export import Part, Stacks, save_readings
@@ -140,31 +140,31 @@ def read_forces(
         group: list[Scan] = []
         try:
             for scan in islice(scans, _READ_SCANS):
-                if reader is None:
-                    with naming(part.path):
-                        reader = SkinReader(part.boards[0], calibration, force=force)
-                try:
-                    reader.check_mode(scan.mode)
-                except ValueError as exc:
-                    remedy = "export each part by its own calibration"
-                    raise part.error(f"after {part.after_s:.3f} s, {exc}: {remedy}") from exc
                 group.append(scan)
         except OhmskinError as exc:
             failure = exc
-        if reader is not None and group:
-            yield from reader.read_all(group)
-        elif failure is None:
-            return
-    raise failure
+        if not group:
+            break
+        if reader is None:
+            with naming(part.path):
+                reader = SkinReader(part.boards[0], calibration, force=force)
+        yield from reader.read_all(group)
+    if failure is not None:
+        raise failure
 
 
 def _tared(part: Part) -> Iterator[Scan]:
-    """The scans, each with the tare before it, as long as they are of one unit."""
+    """The scans, each with the tare before it, as long as one reader can read them."""
+    remedy = "export each part by its own calibration"
     for scan in part:
-        unit_id, first_id = part.boards[-1].unit_id, part.boards[0].unit_id
-        if unit_id != first_id:
-            came = f"unit {unit_id} has come in place of unit {first_id}"
-            raise part.error(f"{came}: export each part by its own calibration")
+        first, unit_id = part.boards[0], part.boards[-1].unit_id
+        if unit_id != first.unit_id:
+            came = f"unit {unit_id} has come in place of unit {first.unit_id}"
+            raise part.error(f"{came}: {remedy}")
+        try:
+            check_mode(first, scan.mode)
+        except ValueError as exc:
+            raise part.error(f"after {part.after_s:.3f} s, {exc}: {remedy}") from exc
         tare = tare_of(scan, part.tares)
         yield scan if tare is None else replace(scan, rest_ratio=tare.rest_ratio)
 
