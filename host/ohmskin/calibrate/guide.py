@@ -106,19 +106,17 @@ class OnSkin:
 
     def __init__(self) -> None:
         self.cells: Cells = ()
-        self._differs_s: float | None = None  # since when something else is seen
+        self._differs_s = math.inf  # since when something else is seen
 
     def see(self, time_s: float, pressed: Cells) -> bool:
         """One more scan, at a time of any clock [s]. Returns whether `cells` has changed."""
         if pressed == self.cells:
-            self._differs_s = None
+            self._differs_s = math.inf
             return False
-        # Time goes back where a board was reset.
-        if self._differs_s is None or time_s < self._differs_s:
-            self._differs_s = time_s
+        self._differs_s = min(self._differs_s, time_s)  # time goes back where a board was reset
         if time_s - self._differs_s < CERTAIN_S:
             return False
-        self.cells, self._differs_s = pressed, None
+        self.cells, self._differs_s = pressed, math.inf
         return True
 
 
