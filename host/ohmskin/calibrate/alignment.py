@@ -160,10 +160,7 @@ def correlations(x: Float, in_x: Bool, y: Float, in_y: Bool) -> tuple[Float, Flo
     # differences below would lose digits if the means were not taken off first.
     x = (x - x[in_x].mean()) * mask_x
     y = (y - y[in_y].mean()) * mask_y
-
-    def sums(one: Float, other: Float) -> Float:
-        return np.asarray(correlate(one, other, method="fft"))
-
+    sums = partial(correlate, method="fft")
     shared = np.maximum(np.rint(sums(mask_x, mask_y)), 0.0)
     count = np.maximum(shared, 1.0)
     sum_x, sum_y = sums(x, mask_y), sums(mask_x, y)

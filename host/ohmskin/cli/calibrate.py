@@ -359,8 +359,7 @@ def _knead(
         span = f"{name}, {begin_s:.1f} to {end_s:.1f} s"
         TERMINAL.print(f"left out: {span}, force beside the skin?")
     if wrong.any():
-        text = f"numbers of the scale left out, far from those around them: {wrong.sum()}"
-        TERMINAL.print(text)
+        TERMINAL.print(f"numbers of the scale left out, far from those around them: {wrong.sum()}")
     TERMINAL.print(f"{known} of {stds.size} cells have a gain of their own")
     _conclude(calibration, calibrator, out)
 

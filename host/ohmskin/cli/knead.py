@@ -2,7 +2,7 @@
 """``ohmskin calibrate knead``: press a skin anywhere, over a scale, until all cells are known."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from itertools import takewhile
 from pathlib import Path
 from typing import Final
@@ -117,8 +117,7 @@ def kneaded(
             coverage.ask_more()
         if not coverage.is_done:
             try:
-                with ExitStack() as stack:
-                    page = stack.enter_context(_page(port, skin)) if view else None
+                with _page(port, skin) if view else nullcontext() as page:
                     sensor = sensor_at(skin, *scale)
                     goes_on = _knead(skin, path, sensor, coverage, seconds, page)
             except TareRefused:

@@ -29,8 +29,7 @@ def grams_of(text: str, least: int = 1) -> list[float]:
         masses_g = [float(part) for part in text.split(",")]
     except ValueError:
         masses_g = []
-    good = len(masses_g) >= least and all(0 < mass_g < math.inf for mass_g in masses_g)
-    if not good:
+    if len(masses_g) < least or not all(0 < mass_g < math.inf for mass_g in masses_g):
         raise ValueError(f"--grams {text!r:.60}: give {least} or more above 0, such as 50,100,200")
     if min(masses_g) < _LEAST_G:
         raise ValueError(f"--grams {text!r:.60}: the least is 1 g: write 200 for 0.2 kg")

@@ -89,13 +89,7 @@ _ABOVE_0: Final = ("indenter_area_m2", "largest_force_n")
 _RESTS: Final = ("rest", "tare")
 _MODEL_FIELDS: Final = tuple(field.name for field in fields(ForceModel))
 # Those that may have null in place of numbers.
-_NULL_FIELDS: Final = (
-    "residual_std",
-    "residual_share",
-    "held_out_rmse",
-    "rest.ratio",
-    "tare.ratio",
-)
+_NULLABLE: Final = ("residual_std", "residual_share", "held_out_rmse", "rest.ratio", "tare.ratio")
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +267,7 @@ class Calibration:
             content["geometry"] = of_kind | self.geometry.told
         for name in _MODEL_FIELDS:
             array = getattr(self.model, name)
-            content[name] = _null(array) if name in _NULL_FIELDS else array
+            content[name] = _null(array) if name in _NULLABLE else array
         text = json.dumps(content, allow_nan=False, default=np.ndarray.tolist)
         with whole_file(path) as file:
             file.write(text.encode())
@@ -406,7 +400,7 @@ def _array(name: str, nested: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     if cells.shape != shape:
         raise ValueError(f"{name} has not the shape {shape}")
     wanted = {"pooled": bool, "kind": str}.get(name, float)
-    may_be_null = name in _NULL_FIELDS
+    may_be_null = name in _NULLABLE
     values = [
         np.nan if cell is None and may_be_null else _value(name, cell, wanted)
         for cell in cells.flat
