@@ -181,13 +181,7 @@ class Kneading:
         return Shown(self._totals(levels, log), self._slopes(wires, levels), wires)
 
     def _levels(
-        self,
-        method: str,
-        wires: WireOhm,
-        used: Bool,
-        progress: Progress = iter,
-        *,
-        are_sure: bool = False,
+        self, method: str, wires: WireOhm, used: Bool, progress: Progress, *, are_sure: bool = False
     ) -> _Levels:
         """What a method shows of the scans to use, (n,); those that it doubts are left out.
 

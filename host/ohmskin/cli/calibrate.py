@@ -297,7 +297,7 @@ def _learn_totals(calibrator_of: _CalibratorOf, recordings: list[Recording], out
     usable = joined(recordings)
     for given in usable:  # each rest is checked, and the last one is that of the calibration
         try:
-            calibrator = calibrator_of(given.hellos[-1], _rest_ratio(given, 0.0))
+            calibrator = calibrator_of(given.hellos[-1], given.tares[0].rest_ratio)
         except TareRefused as exc:
             remedy = "move it away, or say --force if nothing was on the skin"
             raise TareRefused(f"{given.name}: {exc.problem}", remedy) from exc

@@ -159,17 +159,16 @@ class KeptAnywhere:
         self.recorder.add(Mark(repr(force_n), self.recorder.now_s()))
 
 
+Kept = KeptPresses | KeptAnywhere
+
+
 def put_anywhere(recordings: Iterable[Recording]) -> list[Press]:
     """What `KeptAnywhere` has kept in recordings."""
     return [Press(ANYWHERE, float(mark.text)) for given in recordings for mark in given.marks]
 
 
 def guided(
-    skin: Device,
-    calibrator: Calibrator,
-    kept: KeptPresses | KeptAnywhere,
-    missing: list[Press],
-    total: int,
+    skin: Device, calibrator: Calibrator, kept: Kept, missing: list[Press], total: int
 ) -> int:
     """Ask for the missing presses. Returns how many still are, after an interruption.
 
