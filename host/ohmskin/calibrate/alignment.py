@@ -30,7 +30,6 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.tables import ForceLog, between_gaps
@@ -77,21 +76,20 @@ class Alignment:
     overlap_s: float
 
 
-def align(scan_time_s: ArrayLike, rise: ArrayLike, log: ForceLog) -> Alignment:
+def align(time_s: Float, rise: Float, log: ForceLog) -> Alignment:
     """The offset at which the skin's edges are most like the force's.
 
-    scan_time_s (n,): the middle of each scan by any clock [s], increasing. rise (n,): of the whole
-    skin above rest, summed over cells [S]. Two clocks whose rates differ are aligned on average.
+    time_s (n,): the middle of each scan by any clock [s], increasing. rise (n,): of the whole skin
+    above rest, summed over cells [S]. Two clocks whose rates differ are aligned on average.
 
     Raises ValueError for bad arrays; if nothing was pressed; if both ran together for too short; if
     nothing fits; and if another offset fits nearly as well, as with presses that repeat evenly.
     """
-    time_s, rises = (np.asarray(values, dtype=np.float64) for values in (scan_time_s, rise))
-    good = np.isfinite(rises) & (np.diff(time_s, prepend=-np.inf) > 0)
+    good = np.isfinite(rise) & (np.diff(time_s, prepend=-np.inf) > 0)
     if not good.all():
         scan = int(np.argmin(good))
         raise ValueError(f"scan {scan}: its rise is not finite, or its time not after the last")
-    x, in_x = _edges(time_s, rises, "the skin's rise")
+    x, in_x = _edges(time_s, rise, "the skin's rise")
     y, in_y = _edges(log.time_s, log.force_n, "the force")
     r, shared = correlations(x, in_x, y, in_y)
     shorter_s = min(np.count_nonzero(in_x), np.count_nonzero(in_y)) * GRID_STEP_S

@@ -146,10 +146,9 @@ class WireSearch:
         told = self._told._replace(lead=lead_ohm, lead_std_ohm=lead_std_ohm)
         taught = self._show(told, FIRST_CELLS).wires
         self._lead = taught.lead_or_usual(USUAL_LEAD_STD_OHM)
-        is_told = [ohm is not None for ohm in self._told[:2]]
         stds = [LAYER_STD if std is None else std for std in taught[3:5]]
         is_sure = self._lead[1] < SURE_LEAD * lead_std_ohm or max(stds) < LAYER_STD
-        believed = taught if is_sure and not any(is_told) else self._told
+        believed = taught if is_sure and self._told[:2] == (None, None) else self._told
         self._centre, self._std = (of_wires[:2] for of_wires in wire_prior(believed))
         is_known = [ohm is not None for ohm in believed[:2]]
         return np.where(is_known, self._centre, np.minimum(self._centre, np.log(START_OHM)))

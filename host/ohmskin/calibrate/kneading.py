@@ -107,9 +107,8 @@ class Kneading:
             reader = PortReader(known)
             assert known.rest_ratio is not None
             rest = reader.read(known.rest_ratio).current
-            currents += [
-                reader.read(scan.ratio, in_order=True).current - rest for scan in given.scans
-            ]
+            for scan in given.scans:
+                currents.append(reader.read(scan.ratio, in_order=True).current - rest)
         rise = np.array(currents).reshape(len(scans), -1)
         rises = rise > TOUCH_SIEMENS
         self.time_s = scan_times_s(scans)

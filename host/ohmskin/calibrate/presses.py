@@ -365,9 +365,8 @@ class Calibrator:
         presses = self.presses_in_table(table)
         if not self.shows_wires:
             self.learn_wires(ratios, presses, in_order=False)
-        levels = (self.estimator.estimate(ratio).level for ratio in ratios)
-        seen = zip(levels, presses.cells, strict=True)
-        rise = np.array([level.flat[cell] for level, cell in seen])
+        seen = zip(ratios, presses.cells, strict=True)
+        rise = np.array([self.estimator.estimate(ratio).level.flat[cell] for ratio, cell in seen])
         rise -= self.rest_level.flat[presses.cells]
         # The deviations in the table are of rises with other wires. As shares of the rise, they are
         # the same with these wires.

@@ -458,15 +458,13 @@ class TotalFit:
 
     def model(self) -> ForceModel:
         """The curves of all cells: power laws as near to those of the fit as there are."""
-        p, shape, cells = self._p, self._totals.shape, np.arange(self._on.shape[1])
+        p, shape = self._p, self._totals.shape
         level, steeper = self._straight()
         by_exponent = level - steeper * np.log(self._unit)
         # log(slope) = k + g + (b + e) by_exponent, exponent = (b + e) steeper
         of_law = np.array([[1.0, by_exponent, 1.0, by_exponent], [0.0, steeper, 0.0, steeper]])
-        numbers = np.broadcast_arrays(
-            0, 1, self._of_gains.start + cells, self._of_bends.start + cells
-        )
-        chosen = np.stack(numbers, axis=-1)
+        gains, bends = np.arange(p.size)[self._of_gains], np.arange(p.size)[self._of_bends]
+        chosen = np.stack(np.broadcast_arrays(0, 1, gains, bends), axis=-1)
         log_slope, exponent = of_law @ p[chosen].T
         covariance = self.covariance_[chosen[:, :, None], chosen[:, None, :]]
         (slope_var, both), (_, exponent_var) = np.moveaxis(of_law @ covariance @ of_law.T, 0, -1)

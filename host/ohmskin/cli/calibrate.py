@@ -72,8 +72,7 @@ Force = Annotated[bool, Option("--force", help="even if cells seem to be touched
 # skin. All else is known from the command line.
 _CalibratorOf = Callable[[Hello, Float], Calibrator]
 calibrate = typer.Typer(
-    no_args_is_help=True,
-    help="Learn forces by a scale, weights or recordings: a calibration file.",
+    no_args_is_help=True, help="Learn forces by a scale, weights or recordings: a calibration file."
 )
 calibrate.command()(scale)
 
@@ -489,9 +488,8 @@ def _finish(
         TERMINAL.print(cell_table(texts.tolist(), title))
     if message:
         error_n = model.held_out_rmse[model.pooled].max()  # NaN where one cell alone was pressed
-        TERMINAL.print(
-            message + (f"; its held-out error is {error_n:.2f} N" if error_n > 0 else "")
-        )
+        off = f"; its held-out error is {error_n:.2f} N" if error_n > 0 else ""
+        TERMINAL.print(message + off)
     _conclude(calibration, calibrator, out)
 
 

@@ -31,8 +31,7 @@ EPILOG: Final = "\n".join(
 
 
 def emulate(
-    url: Annotated[str, Argument(help="an emulator:// URL")] = URL,
-    seconds: Seconds = 0.0,
+    url: Annotated[str, Argument(help="an emulator:// URL")] = URL, seconds: Seconds = 0.0
 ) -> None:
     """Serve an emulated board at a pseudo-terminal. Ctrl-C ends it.
 
