@@ -120,12 +120,8 @@ def weights(
         kept.go_on(skin.info.unit_id)
         shape = skin.info.rows, skin.info.columns
         only, again = cells_of(cells, shape), cells_of(" ".join(redo or ()), shape)
-        wanted = [
-            Press(cell, force_n)
-            for cell in only or np.ndindex(shape)
-            for _ in range(repeats or 2)
-            for force_n in forces_n
-        ]
+        on_each_n = forces_n * (repeats or 2)
+        wanted = [Press(cell, each_n) for cell in only or np.ndindex(shape) for each_n in on_each_n]
         read = [press for press in kept.presses if press.cell not in again]
         missing = still_wanted(wanted, read)
         with naming("--grams, --repeats, --cells"):  # before anybody makes the presses

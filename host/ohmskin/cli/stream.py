@@ -44,6 +44,9 @@ DISPLAY_EVERY_S: Final = 0.1
 # Time between two pictures in a file or a pipe [s]. Chosen: pictures are kept there, and ten times
 # fewer can still be read.
 _PRINT_EVERY_S: Final = 1.0
+# What --json tells of an estimate, and of a contact.
+_OF_ESTIMATE: Final = ("cell_siemens", "cell_siemens_std", "converged", "message", "wires")
+_OF_CONTACT: Final = ("identity", "row", "column", "force_n", "force_n_std")
 
 
 def stream(
@@ -107,28 +110,22 @@ def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan])
             "host_time_s": round(scan.host_time_s, 6),
             "missed": scan.missed,
             "reading_names": scan.reading_names,
-            "ratio": numbers(scan.ratio),
+            "ratio": scan.ratio,
         }
         if reader is not None:
             shown = reader.read(scan)
             line["method"] = reader.method
-            line["cell_siemens"] = numbers(shown.estimate.cell_siemens)
-            line["cell_siemens_std"] = numbers(shown.estimate.cell_siemens_std)
-            line["converged"] = shown.estimate.converged
-            line["message"] = shown.estimate.message
-            line["wires"] = shown.estimate.wires
+            line |= {name: getattr(shown.estimate, name) for name in _OF_ESTIMATE}
             if reader.has_forces:
-                line["force_n"] = numbers(shown.force_n)
-                line["force_n_std"] = numbers(shown.force_n_std)
-                of_contact = ("identity", "row", "column", "force_n", "force_n_std")
+                line |= {"force_n": shown.force_n, "force_n_std": shown.force_n_std}
                 line["contacts"] = [
-                    {name: numbers(getattr(contact, name)) for name in of_contact}
+                    {name: numbers(getattr(contact, name)) for name in _OF_CONTACT}
                     for contact in shown.contacts
                 ]
                 if skin.true_force_n is not None:
-                    line["true_force_n"] = numbers(skin.true_force_n(scan))
+                    line["true_force_n"] = skin.true_force_n(scan)
         try:
-            print(json.dumps(line), flush=True)  # noqa: T201
+            print(json.dumps(line, default=numbers), flush=True)  # noqa: T201
         except BrokenPipeError:
             # The reader, such as `head`, has had enough. Python writes what is left when it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
