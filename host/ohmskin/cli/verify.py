@@ -71,11 +71,7 @@ def verify(
     evidence.loss = loss
     diagnosis = examine(evidence, exam.examine)
     page = as_object(port, diagnosis)
-    figures = {
-        name: numbers(value) if isinstance(value, np.ndarray) else value
-        for name, value in vars(exam).items()
-    }
-    everything = json.dumps(page | {"hello": evidence.board, "exam": figures}, default=asdict)
+    everything = json.dumps(page | {"hello": evidence.board, "exam": vars(exam)}, default=_plain)
     if json_file == "-":
         print(everything)  # noqa: T201
     else:
@@ -89,6 +85,11 @@ def verify(
             _draw(figure, exam)
     if diagnosis.worse:
         raise SystemExit(1)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, and objects with fields as dictionaries, for JSON."""
+    return numbers(value) if isinstance(value, np.ndarray) else asdict(value)
 
 
 def _print_exam(exam: PlateExam) -> None:
