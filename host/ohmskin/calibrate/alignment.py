@@ -191,9 +191,10 @@ def _check_unique(r: Float, score: Float, best: int) -> None:
 
 
 def _vertex(score: Float, best: int) -> float:
-    """Where the parabola through the maximum and its neighbours is highest, in -0.5..0.5."""
-    if not 0 < best < score.size - 1:
-        return 0.0
+    """Where the parabola through the maximum and its neighbours is highest, in -0.5..0.5.
+
+    It has neighbours: where both overlap for long enough, the first and the last lag are far.
+    """
     before, peak, after = score[best - 1 : best + 2]
     bend = before - 2 * peak + after
     return float(0.5 * (before - after) / bend) if bend < 0 else 0.0
