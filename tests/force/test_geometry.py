@@ -116,6 +116,7 @@ def test_the_noise_of_untouched_cells_is_no_net_force(tmp_path: Path) -> None:
     with ohmskin.open("emulator://8x8?scene=rest&seed=1&speed=0", calibration=placed) as skin:
         scan = next(iter(skin))
     noisy = replace(scan, force_n=np.full((8, 8), 0.005))
+    assert noisy.touch_force_n.sum() == 0.0
     assert np.abs(noisy.wrench).max() == 0.0
 
 
@@ -126,6 +127,7 @@ def test_a_net_force_has_the_weak_edge_of_a_touch(tmp_path: Path) -> None:
     share = np.exp(-((row - 3.3) ** 2 + (column - 3.7) ** 2) / 2)
     scan = ohmskin.SimulatedSkin(placed).step(share / share.sum(), 0.0)
     assert sum(contact.force_n for contact in scan.contacts) < 0.9
+    assert scan.touch_force_n.sum() == pytest.approx(1, abs=0.03)
     assert scan.wrench[0] == pytest.approx([0, 0, -1], abs=0.03)
 
 

@@ -188,7 +188,7 @@ def test_values_of_a_newer_definition_have_a_name() -> None:
     assert BoardDecoder().feed(octets, 0.0) == [Ack(0x83, 7, "unknown_200", 0, 0)]
 
 
-@pytest.mark.parametrize("name", ["contacts", "estimate", "force_n", "wrench"])
+@pytest.mark.parametrize("name", ["contacts", "estimate", "force_n", "touch_force_n", "wrench"])
 def test_a_scan_without_forces_says_how_to_get_them(name: str) -> None:
     """Its AttributeError said only that there are none."""
     (scan,) = scans(BoardDecoder(), scan_wire(1))

@@ -73,19 +73,24 @@ class ForceScan(Scan):
     geometry: Geometry | None = None
 
     @property
-    def wrench(self) -> tuple[Float, Float]:
-        """Net force (3,) [N] and torque (3,) [N m] on the skin: `Geometry.wrench`.
+    def touch_force_n(self) -> Float:
+        """`force_n` of touched cells and of those around them, and 0 elsewhere, (R, C) [N].
 
-        Cells count that are touched, and those around them. No force is below 0, so the noise of
-        all other cells would add up: to more than 1 N on an untouched skin of 16x16.
+        Its sum is the total force. No force is below 0, so in the sum of `force_n` the noise of all
+        other cells adds up: to more than 1 N on an untouched skin of 16x16.
+        """
+        of_touches = around(self.contacts, self.force_n.shape)
+        return np.where(of_touches | np.isnan(self.force_n), self.force_n, 0.0)
+
+    @property
+    def wrench(self) -> tuple[Float, Float]:
+        """Net force (3,) [N] and torque (3,) [N m] of `touch_force_n`: `Geometry.wrench`.
 
         :raises ValueError: there are no forces, or no geometry.
         """
         if self.geometry is None and np.isnan(self.force_n).all():
             raise ValueError("no forces: read scans with a calibration, and by its own method")
-        of_touches = around(self.contacts, self.force_n.shape)
-        force_n = np.where(of_touches | np.isnan(self.force_n), self.force_n, 0.0)
-        return required(self.geometry).wrench(force_n)
+        return required(self.geometry).wrench(self.touch_force_n)
 
     def _repr_html_(self) -> str:
         """A heat map of the forces, in a notebook; of the conductances where there are none."""

@@ -42,7 +42,9 @@ _MAX_REF_OHM = 10_000_000
 # No sound board has longer names of itself. Chosen: three times as long as all causes of a reset.
 _MOST_LETTERS = 100
 # Attributes that scans of a calibrated skin alone have, and that people ask others for.
-_OF_FORCES: Final = ("contacts", "estimate", "force_n", "force_n_std", "geometry", "wrench")
+_OF_FORCES: Final = (
+    *("contacts", "estimate", "force_n", "force_n_std", "geometry", "touch_force_n", "wrench"),
+)
 
 
 @dataclass(frozen=True)
