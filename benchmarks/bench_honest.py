@@ -381,6 +381,9 @@ def of_large(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
         found.bar(at_most, f"large_{mode}_{kind}", "wrong", 1)
         found.bar(at_least, f"large_{mode}_{kind}", "within_4", 95)
         found.bar(at_most, f"large_{mode}_{kind}", "right_but_flagged", 5)
+    for mode in ("near", "far"):
+        found.bar(at_most, f"large_{mode}_palms", "wrong", 1)
+        found.bar(at_most, f"large_{mode}_palms", "misnamed", 0)
     return found
 
 
@@ -394,8 +397,8 @@ def of_objects(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
     ]
     found = Pooled(scenes, jobs, progress)
     for mode in ("near", "far"):
-        found.bar(at_most, mode, "wrong", 2)
-        found.bar(at_most, mode, "misnamed", 0)
+        found.bar(at_most, f"{mode}_8x8", "wrong", 1)
+        found.bar(at_most, f"{mode}_8x8", "misnamed", 0)
     return found
 
 

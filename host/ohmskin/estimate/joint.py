@@ -11,7 +11,7 @@ deviations of the answer say how much of it comes from the prior:
 
 The maximum of the posterior is found by a few Gauss-Newton steps (`full_fit`). They begin at the
 few touches that `sparse_fit` finds. If touches are many, as under a fingertip, they begin at the
-cells that `matrix` finds.
+cells that `matrix` finds; under a palm, at rest.
 
 `touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
 few touches. Where they do not explain the frame, or lie as under a fingertip, its answer is that of
