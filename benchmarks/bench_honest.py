@@ -398,7 +398,7 @@ def of_objects(part: Part, seed: int, jobs: int, progress: Progress) -> Pooled:
     found = Pooled(scenes, jobs, progress)
     for mode in ("near", "far"):
         found.bar(at_most, f"{mode}_8x8", "wrong", 1)
-        found.bar(at_most, f"{mode}_8x8", "misnamed", 0)
+        found.bar(at_most, mode, "misnamed", 0)
     return found
 
 

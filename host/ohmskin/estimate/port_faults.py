@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.ports import PortCircuit
-from ohmskin.estimate.knowledge import SkinKnowledge
+from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, SkinKnowledge
 from ohmskin.estimate.port_currents import FarReadings, NearEnds, NearReadings, PortCurrents
 from ohmskin.estimate.port_noise import Spread
 from ohmskin.estimate.prior import HIGHEST_TOUCH_SIEMENS
@@ -57,10 +57,6 @@ DRIFT_SHARE: Final = 0.15
 # Two lines are alike if none of their currents differ by more standard deviations. Chosen: joined
 # electrodes give the same code, or differ by noise, and one code is 3.5 deviations of rounding.
 SAME_STDS: Final = 3.4
-# Lines of the other layer are tied to one node if a line's currents from them differ by a smaller
-# share of what they differed by at rest. Chosen: under half a skin it is 0.36 and less; for lines
-# that are shorted and not touched, 0.78 and more.
-TIED_SHARE: Final = 0.5
 # Touched lines are shorted if no frame shows them apart while so many are compared: three seconds
 # at 90 Hz. Chosen: no finger lies so evenly on two lines for longer.
 ALIKE_FRAMES: Final = 270
@@ -153,9 +149,9 @@ class LinePairs:
     them, or if they are touched at several places: it would have to lie evenly at each of them.
 
     high (lines,): which lines have clearly more current at all of their ports, as a short gives
-    them. In a frame, that is more than the line itself had at rest; at rest, more than the median
-    line. places (lines,): at how many places, each of neighbouring ports, a line has more current
-    than a short alone can give it.
+    them. In a frame, that is more than the line itself had at rest, and more over that than lines
+    which nothing touches; at rest, more than the median line. places (lines,): at how many places,
+    each of neighbouring ports, a line has more current than a short alone can give it.
     """
 
     def __init__(self, axis: int, rest: PortCurrents, least_std: float) -> None:
@@ -163,7 +159,7 @@ class LinePairs:
         self._axis, self._least_std = axis, least_std
         self._lines, self._ports = (rest.current if axis == 0 else rest.current.T).shape
         self._rest_std = self._largest_std(rest)
-        self._rest_apart, self._rest_differ = self._apart(rest), self._differ(rest)
+        self._rest_apart = self._apart(rest)
         self.reset()
 
     def reset(self) -> None:
@@ -218,11 +214,6 @@ class LinePairs:
         # frame, and need not be alike for long. But a touch at one place may be a finger on both.
         since = self._never_apart & (least_places != 1)
         is_shorted = alike & differed & (since | (self._alike_frames >= ALIKE_FRAMES))
-        # Hard touches over many cells tie all lines of the other layer to one node. A line that is
-        # not touched draws the same current from each of them then, that of all its cells, and
-        # sums of cells may be alike.
-        tied = self._differ(now) < TIED_SHARE * self._rest_differ
-        is_shorted &= ~(tied & tied[:, None])
         doubt = alike & (self._never_apart | (self._alike_frames >= DOUBT_FRAMES))
         doubt &= least_places > 0
         in_doubt = np.asarray(doubt.any(axis=0) | doubt.any(axis=1))
@@ -242,11 +233,6 @@ class LinePairs:
         difference = np.abs(current[:, None, :] - current)
         difference /= np.maximum(std[:, None, :], std)
         return np.asarray(difference.max(axis=2))
-
-    def _differ(self, ports: PortCurrents) -> Float:
-        """By how much the currents of each line differ, over their mean, (lines,)."""
-        current = ports.current if self._axis == 0 else ports.current.T
-        return np.asarray(np.ptp(current, axis=1) / np.maximum(current.mean(axis=1), 1e-12))
 
     def _largest_std(self, ports: PortCurrents) -> float:
         return max(float(ports.std.max()), self._least_std)
@@ -307,12 +293,19 @@ class SkinFaults:
         fault = self._loss(now, self._rest)
         if fault or not is_whole:
             return fault
-        is_higher = now.current > (1.0 + DRIFT_SHARE) * self._rest.current
+        over_rest = now.current / np.maximum(self._rest.current, MIN_CELL_SIEMENS)
         is_touched = now.current > TOUCHED_TIMES * self._rest.current + FAULT_STDS * now.std
         for axis, pairs in enumerate(self._pairs):
-            high = np.asarray(is_higher.all(axis=1 - axis))
+            high = np.asarray((over_rest > 1.0 + DRIFT_SHARE).all(axis=1 - axis))
             touched = is_touched if axis == 0 else is_touched.T
             if pairs.needs_frame(high, np.asarray(touched.any(axis=1))):
+                # Touches raise the currents of untouched lines as well. Under an edge or half a
+                # palm, they tie all lines of the other layer to one node: then an untouched line
+                # draws the same current from each of them, and two lines may be alike by chance.
+                lines = len(high) // 4  # so many have less, and no touch
+                untouched = np.partition(over_rest, lines, axis).take([lines], axis)
+                higher = over_rest > (1.0 + DRIFT_SHARE) * untouched
+                high &= higher.all(axis=1 - axis)
                 begins = touched[:, 1:] & ~touched[:, :-1]
                 places = touched[:, 0] + np.count_nonzero(begins, axis=1)
                 pair, doubt = pairs.compare(now, high, places)
