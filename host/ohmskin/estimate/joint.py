@@ -191,8 +191,7 @@ class JointEstimator(Estimator):
         self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None, *, again: bool
     ) -> tuple[Solution, bool]:
         """`_fitted` of all resistances. Damages, and the belief about the wires, learn from it."""
-        level = rest_level(ports.current, self.knowledge.ref_ohm)
-        is_palm = bool(level > PALM_TIMES * np.exp(-prior.expected.mean()))
+        is_palm = touches is None and self._shows_palm(prior, ports)
         start = prior.expected if is_palm else self._start(prior, ports, touches)
         fit, is_tip = self._fit_all(prior, ports, start, is_palm=is_palm)
         self._touches = prior.touches(fit.log_cells)
@@ -236,6 +235,11 @@ class JointEstimator(Estimator):
         is_tip = is_palm or fit_prior is not prior
         self._belief.expect_usual(is_tip or prior.is_crowded(start))
         return FullFit(fit_prior, self._belief, ref_ohm, ports, start), is_tip
+
+    def _shows_palm(self, prior: CellPrior, ports: PortReadings) -> bool:
+        """Whether the median port shows that a palm is on the skin, or something flat."""
+        level = rest_level(ports.current, self.knowledge.ref_ohm)
+        return bool(level > PALM_TIMES * np.exp(-prior.expected.mean()))
 
     def _few_touches(self, prior: CellPrior, ports: PortReadings) -> FewTouches | None:
         """The touched cells, if they are few; else None.
