@@ -302,8 +302,9 @@ class SkinFaults:
                 # Touches raise the currents of untouched lines as well. Under an edge or half a
                 # palm, they tie all lines of the other layer to one node: then an untouched line
                 # draws the same current from each of them, and two lines may be alike by chance.
-                lines = len(high) // 4  # so many have less, and no touch
-                untouched = np.partition(over_rest, lines, axis).take([lines], axis)
+                # The lower quarter of the lines is taken for untouched ones.
+                quarter = len(high) // 4
+                untouched = np.partition(over_rest, quarter, axis).take([quarter], axis)
                 higher = over_rest > (1.0 + DRIFT_SHARE) * untouched
                 high &= higher.all(axis=1 - axis)
                 begins = touched[:, 1:] & ~touched[:, :-1]
