@@ -180,7 +180,7 @@ class PartialEnds:
         of_mean, of_apart = board.offset_share
         offset = of_mean * slope.sum() ** 2 + 0.25 * of_apart * (slope @ APART_SIGN[kinds]) ** 2
         error = error + noise * offset / square_ohm
-        std = np.broadcast_to(np.sqrt(error / square_ohm), current.shape)
+        std = np.sqrt(error / square_ohm)
         if not kinds.all():
             current = self._excess.added(current, tuple(np.flatnonzero(kinds)))
         is_read, last = ~np.isnan(current), self._last.ports

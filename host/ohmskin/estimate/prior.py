@@ -285,7 +285,8 @@ def siemens_std(
     # d log I = - r / (r + series) d log r. So at the limits the current is (1 +- off) I, and the
     # whole resistance is (r + series) / (1 +- off). The cell's is this less `series_ohm`.
     reach_per_std = REACH_STDS * cell_ohm / (cell_ohm + series_ohm)
-    log_std = np.hypot(own_std, np.linalg.norm(by_means * means_std, axis=1))
+    square = by_means * by_means
+    log_std = np.sqrt(own_std * own_std + square @ means_std**2)
     off_up, off_down = reach_per_std * own_std, np.minimum(reach_per_std * log_std, 1.0 - 1e-6)
     own_ohm = (cell_ohm + series_ohm) * off_up / (1.0 + off_up)
     highest_ohm = (cell_ohm + off_down * series_ohm) / (1.0 - off_down)
@@ -295,10 +296,11 @@ def siemens_std(
     bounds = most.argmin(axis=0)
     reach = np.minimum(upper.reach, most[bounds, range(3)])
     together = (by_means[:, None] * most[bounds]).max(axis=2).min(axis=1)
-    share = np.minimum(np.linalg.norm(by_means * reach, axis=1), together)
+    limits = np.array([reach, upper.reach, upper.stds])
+    taken, highest, stated = np.sqrt(limits**2 @ square.T)
+    share = np.minimum(taken, together)
     # As how many deviations the limits count.
-    stated = np.maximum(np.linalg.norm(by_means * upper.stds, axis=1), 1e-30)
-    count = np.maximum(np.linalg.norm(by_means * upper.reach, axis=1) / stated, REACH_STDS)
+    count = np.maximum(highest / np.maximum(stated, 1e-30), REACH_STDS)
 
     def rise_siemens(less_ohm: Float) -> Float:
         return 1.0 / np.maximum(cell_ohm - less_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS) - siemens
