@@ -21,6 +21,7 @@ wires     20 skins, wires of 20 ohm to 2 kohm: how often those of a layer that `
           found are within 30 ohm or 12 %, and within 2 of their deviations [%].
 small     2x2 and 3x3, five pairs: over `joint` told.
 few       presses of 12 cells alone, of 8x8, five pairs: over `joint` told, over `ohm`.
+sparse    one, two, three presses of every cell, and five, 8x8, 50/100 and 500/1000: RMSE [N].
 newtons   leads of 600 ohm at every line, 100/200 ohm a segment: over `ohm`.
 leads     conductances, no forces: 100/200 ohm a segment, leads of so many ohm at every line; random
           touches, and fingertips. within_4: of pressed cells. wrong: frames with a cell off by
@@ -63,6 +64,7 @@ METHODS = ("joint", "touch")
 SEED = 9000  # of the first skin
 BENDS = (0.75, 1.35)  # wires over those at the calibration
 LEADS = "leads"  # the group of conductances
+SPARSE = (5, 3, 2, 1)  # presses of every cell
 KINDS, READOUTS = ("random", "fingers"), ("near", "told", "far")
 LEADS_OHM = (100, 300, 1000, 3000)
 Numbers = dict[str, float | None]  # figures by name; None: infinite, since calibrations are refused
@@ -198,6 +200,14 @@ def tasks_of(group: str, part: Part, seed: int) -> list[Task]:
             return [Task(group, replace(plan, shape=(n, n))) for n in (2, 3) for plan in plans]
         case "few":
             return [Task(group, replace(plan, presses_of=12)) for plan in plans]
+        case "sparse":
+            ways, usual = (OHM, Way("joint")), (FIVE[1], FIVE[3])
+            return [
+                Task(group, replace(plan, presses=presses), ways)
+                for presses in SPARSE[: part.of(len(SPARSE))]
+                for plan in plans
+                if plan.wire_ohm in usual or part is not ALL
+            ]
         case "newtons":
             behind = [replace(plan, wire_ohm=NOMINAL_WIRE_OHM, lead_ohm=600.0) for plan in plans]
             return [
@@ -306,6 +316,16 @@ def disagrees(shown: Shown) -> Iterator[float]:
     yield from (100.0 * ("disagree" in one.said) for way, one in shown.by.items() if way != TOLD)
 
 
+def rmse_n(presses: int) -> Of:
+    """RMSE of `joint` untold, of skins each of whose cells was pressed so often [N]."""
+
+    def of(shown: Shown) -> Iterator[float]:
+        if shown.task.plan.presses == presses:
+            yield shown.by[Way("joint")].rmse_n[0]
+
+    return of
+
+
 FIGURES = [
     *(figure for method in METHODS for figure in figures_of(method)),
     Figure(
@@ -313,6 +333,7 @@ FIGURES = [
     ),
     Figure("force", "no_leads_told_over_before_worst", over_before(NO_LEADS), np.max),
     Figure("wrong", "wrong_said", disagrees, np.mean, at_least, 100),
+    *(Figure("sparse", f"joint_{n}_presses_n", rmse_n(n), np.mean) for n in SPARSE),
     Figure("wires", "wires_near", near, np.mean, at_least, 90),
     Figure("wires", "wires_within_2", stated, np.mean, at_least, 90),
 ]

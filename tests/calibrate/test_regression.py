@@ -190,12 +190,37 @@ def test_one_cell_alone_serves_the_others_without_a_standard_deviation() -> None
     np.testing.assert_array_equal(np.isnan(found.model_.held_out_rmse), found.model_.pooled)
 
 
-def test_cells_with_too_little_of_their_own_are_pooled() -> None:
+def test_cells_with_too_little_for_a_curve_have_a_gain() -> None:
     rise, force_n = presses(34, 13)
     cells = np.array([0] * 20 + [1] * 4 + [2] * 10)
     force_n[cells == 2] = 3.0  # the same force all over
-    found = ForceRegression().fit(cells, rise, force_n, shape=(1, 3))
-    np.testing.assert_array_equal(found.model_.pooled, [[False, True, True]])
+    found = ForceRegression().fit(cells, rise, force_n, shape=(1, 4))
+    np.testing.assert_array_equal(found.model_.pooled, [[False, False, False, True]])
+    assert found.message_ == (
+        "2 of 4 cells take the curve of all presses, with their own gain\n"
+        "1 of 4 cells take the curve of all presses"
+    )
+
+
+@pytest.mark.parametrize("exponent", [0.65, 1.0])
+def test_few_presses_of_a_cell_tell_its_gain(exponent: float) -> None:
+    """Cells differ by 20 %. A cell is pressed twice, or never: all say rightly how far off."""
+    random = np.random.default_rng(26)
+    shape = (20, 20)
+    sensitivity = np.exp(0.2 * random.standard_normal(400))
+    cells = np.repeat(np.arange(200), 2)
+    rise, force_n = presses(cells.size, 27, exponent)
+    found = ForceRegression().fit(cells, rise * sensitivity[cells], force_n, shape=shape)
+    rise, force_n = presses(400, 28, exponent)
+    predicted, std = found.model_.predict((rise * sensitivity).reshape(shape), np.zeros(shape))
+    off, pressed = predicted - force_n.reshape(shape), ~found.model_.pooled
+    rmse_n = [float(np.sqrt(np.mean(off[which] ** 2))) for which in (pressed, ~pressed)]
+    within = [np.mean((np.abs(off) <= 2 * std)[which]) for which in (pressed, ~pressed)]
+    print(f"pressed twice, never: {rmse_n} N, {within} within 2 std")
+    assert rmse_n[0] < 0.8 * rmse_n[1]
+    assert all(0.90 <= share <= 0.99 for share in within)
+    held_out = np.sqrt(np.mean(found.model_.held_out_rmse[pressed] ** 2))
+    assert rmse_n[0] * 0.9 < held_out < rmse_n[0] * 2
 
 
 def test_one_odd_cell_does_not_spoil_the_others() -> None:

@@ -316,8 +316,11 @@ def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
         ({"--wires": "-1,2"}, ["top_wire_ohm is -1"]),
         ({"--cells": "0;1"}, ["'0;1' is no cell: write row,column"]),
         ({"--cells": "0,0 1,0"}, ["cell (1, 0) is not on this 1x2 skin"]),
-        ({"--cells": "0,0"}, ["--cells: all presses are on cell (0, 0): press at least one more"]),
-        ({"--cells": "0,0", "--repeats": "1"}, ["too few presses: 3, 5 are needed"]),
+        ({"--cells": "0,0"}, ["too few presses: 3, 5 are needed"]),
+        (
+            {"--cells": "0,0", "--repeats": "2"},
+            ["--cells: all presses are on cell (0, 0): press at least one more"],
+        ),
         ({"--redo": "0,2"}, ["cell (0, 2) is not on this 1x2 skin"]),
     ):
         arguments = [word for pair in (good | options).items() for word in pair]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A skin that is calibrated by a recording of presses, as users do it, and touched after that.
 
-A robot presses cell after cell, five times each with about 0.4 to 8 N. `PressedSkin.record` writes
-what a board reads meanwhile, and the forces; `calibrate` runs ``ohmskin calibrate recording`` on
-that; `PressedSkin.read` reads many touches by a `SkinReader`. Readings are those of the node
+A robot presses cell after cell, up to five times each with about 0.4 to 8 N. `PressedSkin.record`
+writes what a board reads meanwhile, and the forces; `calibrate` runs that command on the recording;
+`PressedSkin.read` reads many touches by a `SkinReader`. Readings are those of the node
 Laplacian, which shares no code with the estimators, with noise and 10 bits. Every resistance of a
 skin scatters by 10 % about its layer's.
 """
@@ -139,6 +139,7 @@ class Plan:
     wire_ohm: a segment of the top layer, and of the bottom one. law: a name of `LAWS`.
     seed: of everything. shape: of the skin. lead_ohm: a lead of every line.
     presses_of: so many cells, at random, are pressed; None: all.
+    presses: of each of these, the hardest ones of five.
     touches: so many frames are read later, each of other touches.
     """
 
@@ -148,6 +149,7 @@ class Plan:
     shape: tuple[int, int] = (8, 8)
     lead_ohm: float = 0.0
     presses_of: int | None = None
+    presses: int = PEAKS_N.size
     touches: int = 100
 
 
@@ -163,7 +165,8 @@ class PressedSkin:
         self.rest = replace(rest, lead_ohm=leads_ohm)
         # Of each cell: times and forces, straight in between.
         self._knots: list[list[tuple[float, float]]] = [[(0.0, 0.0)] for _ in range(cells)]
-        end_s = self._press(np.sort(random.permutation(cells)[: plan.presses_of]))
+        pressed = np.sort(random.permutation(cells)[: plan.presses_of])
+        end_s = self._press(pressed, PEAKS_N[-plan.presses :])
         self._scans_s = np.arange(0.0, end_s, 1 / RATE_HZ)
         read_s = self._touch(end_s, plan.touches)
         knots_s = [time_s for knots in self._knots for time_s, _ in knots]
@@ -180,12 +183,12 @@ class PressedSkin:
         with ohmskin.open(f"emulator://{size}", start=False) as board:
             self._hello = board.info
 
-    def _press(self, cells: NDArray[np.intp]) -> float:
+    def _press(self, cells: NDArray[np.intp], peaks_n: Float) -> float:
         """A robot presses these cells, one after another. Returns when it is done [s]."""
         now_s = UNTOUCHED_S
         for cell in cells:
-            lift = 1 + PEAK_SPREAD * self._random.uniform(-1, 1, PEAKS_N.size)
-            times_s, forces_n = robot_presses(list(PEAKS_N * lift), self._random, 0.0)
+            lift = 1 + PEAK_SPREAD * self._random.uniform(-1, 1, peaks_n.size)
+            times_s, forces_n = robot_presses(list(peaks_n * lift), self._random, 0.0)
             self._knots[cell] += zip(now_s + times_s / PACE, forces_n, strict=True)
             now_s += (times_s[-1] + LEAVE_S) / PACE
         return float(now_s)

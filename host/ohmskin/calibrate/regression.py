@@ -39,7 +39,9 @@ The s that a curve is kept with differs from that of the fit in three ways:
    freedom, whose variance is s^2 (n - p) / (n - p - 2).
 2. The mean of d^2 / v over the presses is taken off, because predicting adds it again.
 3. It is at least the s of held-out presses where presses have several rows, which are alike and so
-   scatter too little. For cells that nobody pressed, it is at least that of held-out cells.
+   scatter too little.
+
+A cell with fewer presses than a curve needs has the curve of all presses times its gain (`gains`).
 """
 
 from dataclasses import fields, replace
@@ -50,6 +52,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ohmskin.arrays import Float
+from ohmskin.calibrate.gains import find_gains
 from ohmskin.calibrate.rules import MIN_PRESSES, check_enough, require_forces, require_rows
 from ohmskin.force.curve import (
     LINEAR,
@@ -84,8 +87,8 @@ _LEAST_SHARE: Final = 1e-6
 class ForceRegression:
     """Learns every cell's curve from single touches.
 
-    After `fit`: `model_`, the curves; `message_`: which cells have no curve of their own, empty if
-    none.
+    After `fit`: `model_`, the curves; `message_`: how many cells have no curve of their own, empty
+    if none.
     """
 
     def fit(
@@ -104,8 +107,8 @@ class ForceRegression:
         or 1 for `voltage`]. force_n (n,) [N]. shape: (R, C). press (n,): an integer for each press;
         its rows are alike, so they are held out together. Absent, each row is a press.
 
-        A cell keeps a curve of its own from 5 presses on, if its force varies and rises with x; the
-        others take the curve of all presses, with the error it shows on cells not fitted.
+        A cell keeps a curve of its own from 5 presses on, if its force varies and rises with x. The
+        others take the curve of all presses, times the gain that their own presses tell.
         Standard errors of coefficients suppose independent rows. Raises ValueError, naming the row,
         for bad values; for fewer than 5 presses, for forces all the same or that fall with x.
         """
@@ -118,21 +121,25 @@ class ForceRegression:
             press=_array("press", np.arange(size) if press is None else press, size, np.intp),
         )
         _check(rows, shape)
-        of_skin = _curve_of_skin(rows)
-        own = _curves_of_cells(rows)
-        every_cell = range(shape[0] * shape[1])
-        curves = [own.get(cell, of_skin) for cell in every_cell]
+        curves, own = _curves_by_gain(rows, shape[0] * shape[1]), _curves_of_cells(rows)
+        for cell, curve in own.items():
+            curves[cell] = curve
         arrays = {
             field.name: np.array([getattr(curve, field.name) for curve in curves]).reshape(shape)
             for field in fields(Curve)
         }
-        pooled = np.array([cell not in own for cell in every_cell]).reshape(shape)
+        is_unknown = np.isnan(arrays["residual_std"])
+        pooled = np.ones(shape, dtype=bool)
+        pooled.flat[rows.cell] = False
+        pooled |= is_unknown
         self.model_ = ForceModel(**arrays, pooled=pooled)
-        self.message_ = ""
+        lines, take = [], f"of {pooled.size} cells take the curve of all presses"
+        if by_gain := np.count_nonzero(~pooled) - len(own):
+            lines = [f"{by_gain} {take}, with their own gain"]
         if pooled.any():
-            self.message_ = f"{pooled.sum()} of {pooled.size} cells take the curve of all presses"
-            if np.isnan(of_skin.residual_std):
-                self.message_ += ": how far they are off is unknown"
+            unknown = ": how far they are off is unknown" if is_unknown.any() else ""
+            lines += [f"{pooled.sum()} {take}{unknown}"]
+        self.message_ = "\n".join(lines)
         return self
 
 
@@ -151,21 +158,37 @@ class _Rows(NamedTuple):
     press: NDArray[np.intp]
 
 
-def _curve_of_skin(rows: _Rows) -> Curve:
-    """The curve of all presses, for cells without a curve of their own."""
+def _curves_by_gain(rows: _Rows, cells: int) -> list[Curve]:
+    """The curve of all presses, times the gain of each of so many cells."""
     is_one_cell = np.unique(rows.cell).size == 1
-    if is_one_cell:
-        trial = _Trial(rows, rows.press, PRESS_FOLDS)
-    else:  # whole cells are held out: what counts is the error on cells that nobody pressed
-        trial = _Trial(rows, rows.cell, MAX_CELL_FOLDS)
-    grows = _is_clear(trial.gain_of_growing(), SCATTER_ERRORS)
-    curve = trial.best(grows, of_skin=True)
+    # Whole cells are held out: what counts is the error on cells that nobody pressed.
+    alike, parts = (rows.press, PRESS_FOLDS) if is_one_cell else (rows.cell, MAX_CELL_FOLDS)
+    trial = _Trial(rows, alike, parts)
+    curve = trial.fitted(grows=False)
     if curve is None:
         raise ValueError("force does not rise with the cells' rise: is the rest of this skin?")
-    if is_one_cell:  # nothing tells how large the error is on other cells
+    error_n = trial.errors.get((curve.kind, False))
+    if is_one_cell or error_n is None:  # nothing tells how large the error is on other cells
         nan = np.nan
-        return replace(curve, residual_std=nan, residual_share=nan, held_out_rmse=nan)
-    return curve
+        return [replace(curve, residual_std=nan, residual_share=nan, held_out_rmse=nan)] * cells
+    curve_n = np.maximum(force_by(curve, rows.x), 0.0)
+    held_out_n = rows.force - error_n
+    gains = find_gains(rows.press, rows.cell, rows.force, curve_n, held_out_n, cells)
+    share = curve.slope_std / curve.slope
+    shares = np.maximum(np.hypot(share, gains.std / gains.gain), 1e-30)
+    slopes = curve.slope * gains.gain
+    of_cells = slopes, slopes * shares, curve.correlation * share / shares, gains.held_out_rmse
+    return [
+        replace(
+            curve,
+            slope=slope,
+            slope_std=slope_std,
+            correlation=correlation,
+            residual_std=gains.scatter_n,
+            held_out_rmse=held_out_rmse,
+        )
+        for slope, slope_std, correlation, held_out_rmse in np.transpose(of_cells).tolist()
+    ]
 
 
 def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
@@ -267,6 +290,8 @@ class _Trial:
     alike: a number for each row, (n,), of its press or cell. Rows of one number are a group, which
         is held out as a whole: a curve that is fitted to some of them would know the others, too.
     parts: the groups are split into at most so many parts.
+
+    errors: of each row [N], by candidate, (n,).
     """
 
     def __init__(self, rows: _Rows, alike: NDArray[np.intp], parts: int) -> None:
@@ -275,7 +300,7 @@ class _Trial:
         self._groups = int(self._group.max()) + 1
         self._floor_n = FLOOR_SHARE * float(rows.force.max())  # F0
         self._v = {False: np.ones_like(rows.force), True: rows.force**2 + self._floor_n**2}
-        self._errors: dict[tuple[str, bool], Float] = {}  # of each row [N], by candidate
+        self.errors: dict[tuple[str, bool], Float] = {}
         parts = min(parts, self._groups)
         # Shuffled, because forces often rise from press to press: a part that is held out must not
         # be all of the large ones.
@@ -288,18 +313,20 @@ class _Trial:
                 if curve is not None:
                     error[out] = rows.force[out] - np.maximum(force_by(curve, rows.x[out]), 0.0)
             if np.isfinite(error).all():
-                self._errors[kind, grows] = error
+                self.errors[kind, grows] = error
 
-    def best(self, grows: bool, *, of_skin: bool = False) -> Curve | None:
-        """The curve of the kind that predicts held-out groups better; None where no curve rises.
-
-        of_skin: the curve is for cells that nobody pressed, and the groups are cells.
-        """
+    def fitted(self, grows: bool) -> Curve | None:
+        """The curve of the kind that predicts held-out groups better; None where no curve rises."""
         rows, v = self._rows, self._v[grows]
         fits = (_FITS[kind](rows.x, rows.force, v) for kind in self._kinds(grows))
-        curve = next((fit for fit in fits if fit is not None), None)
+        return next((fit for fit in fits if fit is not None), None)
+
+    def best(self, grows: bool) -> Curve | None:
+        """The same, with how presses scatter about it."""
+        curve = self.fitted(grows)
         if curve is None:
             return None
+        rows, v = self._rows, self._v[grows]
         coefficients = 2 if curve.is_power else 1
         # Numbers are those of the module's list. 1: in s^2 times Student's factor, n - p cancels.
         freedom = rows.x.size - coefficients
@@ -307,11 +334,9 @@ class _Trial:
         square = float(np.sum((rows.force - predicted) ** 2 / v)) / (freedom - 2)
         by_rise = float(np.mean(off**2 / v))  # 2
         s = float(np.sqrt(max(square - by_rise, 0.0)))
-        error = self._errors.get((curve.kind, grows), np.full_like(v, np.nan))
+        error = self.errors.get((curve.kind, grows), np.full_like(v, np.nan))
         held_out_s = _rms(error / np.sqrt(v))
-        if of_skin:  # 3, of cells; `maximum` lets NaN stay, where no error is known
-            s = float(np.maximum(s, held_out_s))
-        elif self._groups < rows.x.size:  # 3, of presses of several rows; Student's factor by them
+        if self._groups < rows.x.size:  # 3; Student's factor by presses
             freedom = self._groups - coefficients
             s = float(np.maximum(s, held_out_s * np.sqrt(freedom / (freedom - 2))))
         s0, s1 = (s * self._floor_n, s) if grows else (s, 0.0)
@@ -323,13 +348,13 @@ class _Trial:
         Each way of scattering is tried with the kind of curve that is the better one under it.
         """
         constant, growing = ((self._kinds(grows)[0], grows) for grows in (False, True))
-        if constant not in self._errors or growing not in self._errors:
+        if constant not in self.errors or growing not in self.errors:
             return np.empty(0)
         return self._log_likelihood(*growing) - self._log_likelihood(*constant)
 
     def _kinds(self, grows: bool) -> list[str]:
         """The kinds to try, the better one first; a line if no kind has errors to compare."""
-        tried = [kind for kind in _FITS if (kind, grows) in self._errors]
+        tried = [kind for kind in _FITS if (kind, grows) in self.errors]
         if len(tried) == 2:
             gain = self._log_likelihood(POWER, grows) - self._log_likelihood(LINEAR, grows)
             return [POWER, LINEAR] if _is_clear(gain, 1) else tried
@@ -337,7 +362,7 @@ class _Trial:
 
     def _log_likelihood(self, kind: str, grows: bool) -> Float:
         """l of the module's equation for a candidate, the mean over the rows of each group."""
-        error, v = self._errors[kind, grows], self._v[grows]
+        error, v = self.errors[kind, grows], self._v[grows]
         least = _LEAST_SHARE**2 * float(np.mean(self._rows.force**2 / v))
         v = v * max(float(np.mean(error**2 / v)), least)
         of_rows = -0.5 * np.log(v) - 0.5 * error**2 / v

@@ -91,7 +91,7 @@ def weights(
     ] = False,
     repeats: Annotated[
         int | None,
-        Option(min=1, max=1000, help="times each weight is put on each cell: 2, anywhere 20"),
+        Option(min=1, max=1000, help="times each weight is put on each cell: 1, anywhere 20"),
     ] = None,
     cells: Annotated[str, Option(help="row,column of each, '0,0 0,1'; default: all")] = "",
     redo: Annotated[list[str] | None, Option(help="row,column: drop its presses first")] = None,
@@ -120,7 +120,7 @@ def weights(
         kept.go_on(skin.info.unit_id)
         shape = skin.info.rows, skin.info.columns
         only, again = cells_of(cells, shape), cells_of(" ".join(redo or ()), shape)
-        on_each_n = forces_n * (repeats or 2)
+        on_each_n = forces_n * (repeats or 1)
         wanted = [Press(cell, each_n) for cell in only or np.ndindex(shape) for each_n in on_each_n]
         read = [press for press in kept.presses if press.cell not in again]
         missing = still_wanted(wanted, read)
@@ -476,16 +476,17 @@ def _finish(
     if not model.pooled.all():
         errors = np.char.mod("%.2f", model.held_out_rmse), np.char.mod(" (%d)", presses.counts)
         texts = np.where(model.pooled, "-", np.char.add(*errors))
-        title = "held-out error [N], of so many presses, of cells' own curves"
+        title = "held-out error [N], of so many presses"
         if sum(2 + np.char.str_len(texts).max(axis=0)) > TERMINAL.width:
             hundredths = np.char.mod("%.0f", 100 * model.held_out_rmse)
             texts = np.where(model.pooled, "-", hundredths)
-            title = "held-out error [0.01 N] of cells' own curves"
+            title = "held-out error [0.01 N]"
         TERMINAL.print(cell_table(texts.tolist(), title))
-    if message:
+    if model.pooled.any():
         error_n = model.held_out_rmse[model.pooled].max()  # NaN where one cell alone was pressed
-        off = f"; its held-out error is {error_n:.2f} N" if error_n > 0 else ""
-        TERMINAL.print(message + off)
+        message += f"; its held-out error is {error_n:.2f} N" if error_n > 0 else ""
+    if message:
+        TERMINAL.print(message)
     _conclude(calibration, calibrator, out)
 
 

@@ -60,7 +60,7 @@ class ForceModel:
     correlation: of these two errors, -1 to 1.
     residual_std: s0; NaN where nothing tells it.
     residual_share: s1; NaN where nothing tells it.
-    pooled: the cell has no curve of its own, but that of all presses.
+    pooled: presses tell next to nothing of the cell: its curve is that of all presses.
     held_out_rmse: error on presses that were not fitted [N]; of pooled cells, on cells that were
         not fitted; NaN where nothing tells it.
     """
