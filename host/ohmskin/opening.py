@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack
 from typing import overload
+from urllib.parse import urlsplit
 
 from ohmskin.errors import PortError
 from ohmskin.files import PathName
@@ -88,6 +89,9 @@ def _device(text: str) -> Device:
         case "" | "socket" | "rfc2217":
             url.check_options("baud")
             baud = url.baud  # raises for a wrong URL, before a port is opened
+            with url.blamed():
+                if url.scheme and urlsplit(text).port is None:
+                    raise ValueError(f"which of its ports? Write {url.scheme}://{url.place}:4000")
             return Session(SerialLink(text.partition("?")[0]), baud)
         case "emulator":
             from ohmskin.emulate.urls import open_emulator

@@ -97,6 +97,22 @@ def test_nobody_serves(scheme: str) -> None:
         ohmskin.open(f"{scheme}://127.0.0.1:{port}")
 
 
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ("robot", "which of its ports? Write {}://robot:4000"),
+        ("robot:usb", "Port could not be cast to integer value as 'usb'"),
+        ("robot:99999", "Port out of range 0-65535"),
+    ],
+)
+@pytest.mark.parametrize("scheme", ["socket", "rfc2217"])
+def test_a_port_is_a_number(scheme: str, place: str, reason: str) -> None:
+    """It said that '<=' is not supported between 'int' and 'NoneType', as pyserial does."""
+    with pytest.raises(PortError) as raised:
+        ohmskin.open(f"{scheme}://{place}")
+    assert str(raised.value) == f"{scheme}://{place}: {reason.format(scheme)}"
+
+
 def test_no_other_scheme_is_opened() -> None:
     """One of pyserial's writes what it hears to a file."""
     with pytest.raises(PortError, match="no kind of port 'spy://': there are"):
