@@ -16,6 +16,7 @@ subscriber that asks for best effort gets them as well.
 
 import threading
 from contextlib import suppress
+from operator import sub
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -104,16 +105,14 @@ class SkinNode(Node):
             answer.success, answer.message = False, str(exc)
             return answer
         answer.success, answer.message = diagnosis.sound, verdict(diagnosis)
-        said = [(each.kind.id, words_of(each)) for each in diagnosis.findings]
+        told = [(each.kind.id, words_of(each)) for each in diagnosis.findings]
+        values = [
+            KeyValue(key=f"{kind}: {of['where']}", value=of["what_to_do"]) for kind, of in told
+        ]
+        level = DiagnosticStatus.OK if diagnosis.sound else DiagnosticStatus.WARN
+        name, said, port = f"{self.get_name()}: doctor", answer.message, self.skin.port
         self._doctor = DiagnosticStatus(
-            level=DiagnosticStatus.OK if diagnosis.sound else DiagnosticStatus.WARN,
-            name=f"{self.get_name()}: doctor",
-            message=answer.message,
-            hardware_id=self.skin.port,
-            values=[
-                KeyValue(key=f"{kind}: {words['where']}", value=words["what_to_do"])
-                for kind, words in said
-            ],
+            level=level, name=name, message=said, hardware_id=port, values=values
         )
         return answer
 
@@ -138,9 +137,7 @@ class SkinNode(Node):
             self.get_logger().error(state)
         self._state = state
         now = self.published, self.skin.skipped
-        published, skipped = (
-            count - before for count, before in zip(now, self._before, strict=True)
-        )
+        published, skipped = map(sub, now, self._before)
         self._before = now
         if level == DiagnosticStatus.OK and skipped > SKIPPED_SHARE * (published + skipped):
             what = f"{skipped} of the last {published + skipped} scans were skipped"
