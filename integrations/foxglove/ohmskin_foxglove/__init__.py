@@ -160,7 +160,7 @@ def serve(skin: ohmskin.LiveSkin, port: int = 8765, say: Callable[[str], object]
 
     try:
         server = foxglove.start_server(name="ohmskin", host="127.0.0.1", port=port)
-    except RuntimeError as exc:
+    except (RuntimeError, OverflowError) as exc:  # the latter: above 65535
         raise RuntimeError(f"port {port} is not free ({exc}): say another --ws-port") from exc
     channels = {topic: PointCloudChannel(topic) for topic in (POINTS, CONTACTS)}
     sent: ohmskin.ForceScan | None = None

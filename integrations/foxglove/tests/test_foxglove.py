@@ -336,6 +336,14 @@ def test_a_port_that_is_taken_is_said(skin_json: Path) -> None:
     assert "say another --ws-port" in said
 
 
+@pytest.mark.parametrize("port", [99999, -1])
+def test_a_port_that_cannot_be_is_said(port: int, skin_json: Path) -> None:
+    """It was a traceback."""
+    lines = said_by(*LIVE[:-2], f"--ws-port={port}", URL, skin_json).splitlines()
+    assert lines[-1].startswith(f"ohmskin-foxglove: port {port} is not free")
+    assert "Traceback" not in lines[0]
+
+
 def test_what_is_missing_is_said(recorded: Path, skin_json: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare.json"
     content = json.loads(skin_json.read_text())
