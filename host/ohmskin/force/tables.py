@@ -139,8 +139,7 @@ def read_forces(
     while failure is None:
         group: list[Scan] = []
         try:
-            for scan in islice(scans, _READ_SCANS):
-                group.append(scan)
+            group += islice(scans, _READ_SCANS)
         except OhmskinError as exc:
             failure = exc
         if not group:
