@@ -285,8 +285,8 @@ def check_ratio(
 def _read_of_lines(ratio: Float) -> Bool:
     """Which of the readings (R, C, n) must be there: those of lines and names that were read."""
     is_read = ~np.isnan(ratio)
-    cells, kinds = is_read.any(axis=2), is_read.any(axis=(0, 1))
+    cells, kinds = np.any(is_read, axis=2), np.any(is_read, axis=(0, 1))
     if not kinds.any():
         return np.ones_like(is_read)
-    of_lines = cells.any(axis=1)[:, None] & cells.any(axis=0)
+    of_lines = np.any(cells, axis=1)[:, None] & np.any(cells, axis=0)
     return np.asarray(of_lines[..., None] & kinds)
