@@ -97,6 +97,20 @@ def test_a_file_has_what_was_read(names: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(again.cell_siemens, cells)
 
 
+def test_a_file_has_four_readings_in_any_order(tmp_path: Path) -> None:
+    """They were taken for a b c d, in silence: two were, and are, read by their names."""
+    _, rest, frames = trial("touches")
+    np.savez(tmp_path / "sound.npz", ratio=frames, rest_ratio=rest)
+    read = [3, 2, 0, 1]
+    some = {"ratio": frames[..., read], "rest_ratio": rest[..., read]}
+    np.savez(tmp_path / "other.npz", **some, reading_names=["d", "c", "a", "b"])
+    sound, other = (load_readings(tmp_path / f"{name}.npz") for name in ("sound", "other"))
+    found = [estimate_file(readings, "joint")["cell_siemens"] for readings in (sound, other)]
+    np.testing.assert_array_equal(*found)
+    with pytest.raises(ValueError, match="four near ends come as a b c d, not d c a b"):
+        make_estimator("joint", knowledge(rest)).estimate(frames[0], tuple("dcab"))
+
+
 def test_a_region_is_read_as_well_as_the_whole() -> None:
     """A finger that stays: only the 5x5 cells around it are read after the first scan."""
     made, rest, frames = trial("finger")

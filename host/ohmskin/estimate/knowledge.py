@@ -260,6 +260,8 @@ def check_ratio(
     """
     readings = np.asarray(ratio, dtype=np.float64)
     of_near, width = is_near(of), readings.shape[-1] if readings.ndim else 0
+    if of_near and len(of) == len(NEAR) and tuple(of) != NEAR:
+        raise ValueError(f"{name}: four near ends come as {' '.join(NEAR)}, not {' '.join(of)}")
     if of_near and width not in (len(of), len(NEAR)):
         of = next((names for names in MODES.values() if len(names) == width), of)
     shapes = [(rows, columns, len(of)), *([(rows, columns, len(NEAR))] if of_near else [])]

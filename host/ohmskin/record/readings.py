@@ -112,6 +112,9 @@ class Readings:
         if not 1 <= frames <= MAX_FRAMES:
             raise ValueError(f"ratio has {frames} frames, not 1 to {MAX_FRAMES}: cut it into parts")
         check_size(rows, columns)
+        if {*names} == {*NEAR} and names != NEAR:
+            self._put_in_order()
+            names = NEAR
         if not _in_range(self.ratio):  # all frames at once, which is quick and takes no memory
             for frame, ratio in enumerate(self.ratio):
                 if not _in_range(ratio):
@@ -127,6 +130,15 @@ class Readings:
         each_is_good = _in_range(rest) and all(_in_range(each, most_ohm) for each in wires_ohm)
         for frame in range(1 if each_is_good else frames):
             self.knowledge(frame)  # checks itself
+
+    def _put_in_order(self) -> None:
+        """Let readings that a file has in another order be a b c d, as all that follows wants."""
+        order = [self.reading_names.index(name) for name in NEAR]
+        for name in _RATIOS:
+            ratio = getattr(self, name)
+            if ratio is not None and ratio.shape[-1:] == (len(NEAR),):
+                object.__setattr__(self, name, ratio[..., order])
+        object.__setattr__(self, "reading_names", NEAR)
 
     @property
     def one_skin_per_frame(self) -> bool:
