@@ -463,6 +463,14 @@ def test_a_mean_is_not_of_regions_and_of_few_readings_where_there_are_more() -> 
         device.mean_ratio(scan for scan in scans if not scan.is_whole)
 
 
+def test_a_region_may_be_told_by_arrays() -> None:
+    """An array of one line was taken for no lines, and the board refused an empty mask."""
+    skin = stepped(REST)
+    for line in range(2):
+        skin.set_region(device.Region(np.array([line]), np.array([0, line])))
+        assert (skin.info.row_mask, skin.info.column_mask) == (1 << line, 1 | 1 << line)
+
+
 @pytest.mark.parametrize(
     ("seconds", "times_s", "taken"),
     [

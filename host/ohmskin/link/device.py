@@ -79,7 +79,7 @@ class Region:
             ("column_mask", self.columns, board.columns),
         ):
             masks[name] = protocol.all_lines(count) if lines is None else 0
-            for line in lines or ():
+            for line in () if lines is None else lines:
                 if not 0 <= line < count:
                     raise ValueError(f"no {name.partition('_')[0]} {line}: there are {count}")
                 masks[name] |= 1 << line
