@@ -17,6 +17,7 @@ from rich.console import Console
 import ohmskin
 from calibrations import of_scene
 from command_line import Command, Done, Run, assert_one_line, finish, python, well
+from ohmskin.calibrate.rules import check_complete
 from ohmskin.cli.main import app
 from ohmskin.cli.stream import cell_table
 from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
@@ -24,6 +25,7 @@ from ohmskin.emulate.scale import SCALE_OPTIONS
 from ohmskin.emulate.scenes import BEGIN_S, LEAD_OHM, SCENES, Scene
 from ohmskin.estimate.methods import METHODS
 from ohmskin.link.codes import quantise, ratio_from_codes
+from ohmskin.link.device import Region
 from ohmskin.link.messages import SelfTestReport
 from ohmskin.link.protocol import ENUMS, LAYOUT_CRC
 from ohmskin.link.session import Session
@@ -133,6 +135,31 @@ def test_configure_lasts_on_a_running_board(run: Run, pty_board: Serve) -> None:
     assert_one_line(refused, "takes the readings a b c d, not a e b f", "--mode near")
     assert "8x8 at 90.00 Hz, mode near" in run("configure", path, "--defaults").out
     assert json.loads(run("info", path, "--json").out)["unit_id"] == 0
+
+
+def test_a_region_that_a_program_has_left_is_said_and_can_be_ended(
+    run: Run, pty_board: Serve
+) -> None:
+    """A program that followed contacts was killed: `info` said 4x6 cells, and `calibrate` to do
+    what was done already: "this board is in mode near: 'ohmskin configure PORT --mode near'"."""
+    path = pty_board("emulator://4x6").path
+    with ohmskin.open(path) as skin:
+        skin.set_region(Region([1, 2], [0, 1, 5], mode="near", whole_every=30))
+    said = "rows 1 2, columns 0 1 5; 'ohmskin configure PORT --rows 4 --columns 6' ends that"
+    page = well(run("info", path)).out
+    assert f" {said}; one scan in 30 is of all, in mode near" in page
+    done = well(run("configure", path, "--rate", "90")).out
+    assert "4x6, a region of it (see 'ohmskin info'), at 90.00 Hz" in done
+    with (
+        ohmskin.open(path, start=False) as skin,
+        pytest.raises(ValueError, match="of a region") as no,
+    ):
+        check_complete(skin.info)
+    assert "'ohmskin configure PORT --mode near --rows 4 --columns 6'" in str(no.value)
+    well(run("configure", path, "--mode", "near", "--rows", "4", "--columns", "6"))
+    assert "all cells" in well(run("info", path)).out
+    with ohmskin.open(path, start=False) as skin:
+        check_complete(skin.info)
 
 
 # --------------------------------------------------------------------------------------- scans

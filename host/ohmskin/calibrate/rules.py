@@ -32,9 +32,12 @@ MIN_PRESSES: Final = 5
 def check_complete(board: Hello) -> None:
     """Raise ValueError if scans of this board do not have all readings of all cells."""
     if not board.is_complete:
+        region = "" if board.is_whole else f" --rows {board.rows} --columns {board.columns}"
+        mode = board.mode if board.mode in ("near", "far") else "near"
         raise ValueError(
             "a skin is calibrated in mode near or far, all of it, and this board is in mode "
-            f"{board.mode}: 'ohmskin configure PORT --mode near'"
+            f"{board.mode}{', of a region' if region else ''}: "
+            f"'ohmskin configure PORT --mode {mode}{region}'"
         )
 
 

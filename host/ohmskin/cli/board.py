@@ -26,7 +26,7 @@ from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.device import SILENCE_TIMEOUT_S, scans_for
 from ohmskin.link.messages import Hello, Scan
-from ohmskin.link.protocol import ENUMS, MODES
+from ohmskin.link.protocol import ENUMS, MODES, lines_of
 from ohmskin.link.serial_port import SerialPort, serial_ports
 
 # How each board is flashed: avrdude's options, and its boot loaders by their names in PlatformIO,
@@ -124,6 +124,13 @@ def info(
 def _board_in_words(board: Hello) -> dict[str, str]:
     """What a board says of itself, in people's units, by what it is called."""
     rate = f"{1e-3 * board.rate_asked_mhz:.2f} Hz" if board.rate_asked_mhz else "the fastest"
+    rows = " ".join(map(str, lines_of(board.row_mask, board.rows)))
+    columns = " ".join(map(str, lines_of(board.column_mask, board.columns)))
+    size = f"--rows {board.rows} --columns {board.columns}"
+    region = f"rows {rows}, columns {columns}; 'ohmskin configure PORT {size}' ends that"
+    region = "all cells" if board.is_whole else region
+    if board.whole_every:
+        region += f"; one scan in {board.whole_every} is of all, in mode {board.whole_mode}"
     us = board.settle_asked_us
     settle = f"{us} us" if us else "as long as the rate allows"
     return {
@@ -133,6 +140,7 @@ def _board_in_words(board: Hello) -> dict[str, str]:
         else "as docs/build.md has it",
         "unit id": str(board.unit_id),
         "cells": f"{board.rows} rows, {board.columns} columns",
+        "region": region,
         "mode": f"{board.mode}: readings {' '.join(MODES[board.mode])} of each cell",
         "rate": f"{board.rate_hz:.2f} Hz (asked: {rate})",
         "settle time": f"{board.settle_us} us or more (asked: {settle})",
@@ -176,7 +184,8 @@ def configure(
             skin.set_unit_id(unit_id)
         if save:
             skin.save()
-    done = f"{now.rows}x{now.columns} at {now.rate_hz:.2f} Hz, mode {now.mode}, settle time "
+    part = "" if now.is_whole else ", a region of it (see 'ohmskin info'),"
+    done = f"{now.rows}x{now.columns}{part} at {now.rate_hz:.2f} Hz, mode {now.mode}, settle time "
     kept = "saved" if save else "until its next reset"
     TERMINAL.print(f"{done}{now.settle_us} us or more, {kept}")
 

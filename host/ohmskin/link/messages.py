@@ -106,6 +106,11 @@ class Hello:
         return self.mode == "far"
 
     @property
+    def is_whole(self) -> bool:
+        """Whether scans are of all cells, and not of a region."""
+        return self.readings == self.rows * self.columns * self.readings_per_cell
+
+    @property
     def is_complete(self) -> bool:
         """Whether scans are complete: `Scan.is_complete`."""
         return self.readings == self.rows * self.columns * _COMPLETE_READINGS
