@@ -14,6 +14,7 @@ from calibrations import of_scene
 from ohmskin.arrays import Bool
 from ohmskin.errors import CommandRefused, DeviceLost
 from ohmskin.force.focus import WHOLE_HZ, Focus, Lines, wanted_lines
+from ohmskin.force.reader import SkinReader
 from ohmskin.link.device import Region, scans_for
 from ohmskin.link.messages import Hello
 from ohmskin.record.recorder import Recorder, record
@@ -114,6 +115,19 @@ def test_focus_is_refused_for_a_method_that_takes_no_regions() -> None:
         ValueError, match="'voltage' takes whole scans, and focus reads parts: leav"
     ):
         ohmskin.open("emulator://8x8", calibration=of_skin, focus=True)
+
+
+def test_a_method_that_takes_no_regions_is_not_chosen_while_contacts_are_followed() -> None:
+    """The next scan of a region raised: the page lost its board, and a recording its end."""
+    skin = stepped("emulator://8x8?scene=single&begin=0")
+    reader = SkinReader(skin.info, of_scene("rest", method="voltage", siemens=0.1), method="touch")
+    with reader.focus_on(skin) as reader.focus:
+        with pytest.raises(ValueError, match="'voltage' takes whole scans, and focus reads parts"):
+            reader.use("voltage")
+        assert {reader.read(scan).is_whole for scan in islice(skin, 9)} == {True, False}
+        reader.use("ohm")
+    reader.focus = None
+    reader.use("voltage")
 
 
 @pytest.mark.parametrize(("told_us", "settle_us"), [(0, 100), (40, 40)])

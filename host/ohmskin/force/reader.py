@@ -263,8 +263,13 @@ class SkinReader:
             reader.read(Scan(codes, 0, 0, 0.0, 0, mode=board.mode))
 
     def use(self, method: str) -> None:
-        """Use another method from the next scan on. Raises ValueError if there is none so named."""
+        """Use another method from the next scan on.
+
+        :raises ValueError: there is none so named, or it takes no regions and `focus` is set.
+        """
         self._shared.estimator(method, self.rest)  # so that an error comes here, not at the scan
+        if self.focus is not None:
+            _check_partial(method)
         self._wanted = method
 
     def tare(self, rest_ratio: Float, *, force: bool = False) -> Tare:
@@ -324,9 +329,7 @@ class SkinReader:
 
         Raises what `Focus` raises, and ValueError if the method takes no regions.
         """
-        if not kind_of(self._wanted).takes_partial:
-            remedy = "leave focus out, or use 'joint' or 'touch'"
-            raise ValueError(f"'{self._wanted}' takes whole scans, and focus reads parts: {remedy}")
+        _check_partial(self._wanted)
         return Focus(device, like)
 
     def read(self, scan: Scan) -> ForceScan:
@@ -534,6 +537,13 @@ def check_mode(board: Hello, mode: str) -> None:
     """
     if mode != board.mode and not is_near((*MODES[mode], *MODES[board.mode])):
         raise ValueError(f"the board scanned in mode {board.mode}, now in {mode}")
+
+
+def _check_partial(method: str) -> None:
+    """Raise ValueError if this method takes no regions, which focus reads."""
+    if not kind_of(method).takes_partial:
+        remedy = "leave focus out, or use 'joint' or 'touch'"
+        raise ValueError(f"'{method}' takes whole scans, and focus reads parts: {remedy}")
 
 
 def _layer_std(estimator: Estimator) -> float:
