@@ -388,7 +388,7 @@ def test_order_and_verdict() -> None:
     diagnosis = Diagnosis()
     diagnosis.add(Kind.TOUCHED, moves=True)
     assert diagnosis.worse == []
-    diagnosis.add(Kind.LOST, problem="gone")
+    diagnosis.add(Kind.LOST, problem="gone", late=0)
     assert verdict(diagnosis) == "not sound: 1 finding and 1 note, first lost (board)"
     with pytest.raises(ValueError, match="lost has"):
         diagnosis.add(Kind.LOST)

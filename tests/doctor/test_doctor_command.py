@@ -295,6 +295,17 @@ def test_ports_that_do_not_answer_are_findings(run: Run, pty_board: Serve) -> No
         assert "not sound" in answer["verdict"]
 
 
+@pytest.mark.simavr
+@pytest.mark.usefixtures("hasty")
+def test_a_late_converter_is_the_only_finding_where_no_scan_comes(run: Run) -> None:
+    """Beside "ask for a lower rate", people read that cable, plug and supply are to be checked."""
+    done = run("doctor", "simavr://uno?late_cycles=300", "--json")
+    (found,) = json.loads(done.out)["findings"]
+    assert found["id"] == "lost"
+    assert "conversions late" in found["measured"]
+    assert found["what_to_do"].startswith("lower the rate")
+
+
 def test_a_wrong_url_is_no_finding(run: Run) -> None:
     """Even where no board is: a person wrote it, and no cable mends it."""
     for url, word in (

@@ -151,7 +151,7 @@ def examine(
             of_scans(evidence, usual, diagnosis)
     elif len(evidence.scans) > 1 and not (evidence.lost or stats.restarts):
         size = f"{board.rows}x{board.columns}"
-        diagnosis.add(Kind.LOST, problem=f"it says {size} cells, and its scans have others")
+        diagnosis.add(Kind.LOST, problem=f"it says {size} cells, and its scans have others", late=0)
     diagnosis.findings = merged(diagnosis.findings)
     return diagnosis
 
@@ -170,7 +170,8 @@ def _examine_board(evidence: Evidence, diagnosis: Diagnosis) -> None:
     """Add what the board, its self-test and its USB bridge say."""
     board, report, add = evidence.board, evidence.report, diagnosis.add
     if evidence.lost:
-        add(Kind.LOST, problem=evidence.lost)
+        late = board.late if not evidence.scans else 0
+        add(Kind.LOST, problem=evidence.lost, late=late)
     if report is not None:
         for name in report.findings:
             add(Kind.SELF_TEST, name=name, code_min=report.code_min, code_max=report.code_max)
@@ -190,8 +191,9 @@ def _examine_line(evidence: Evidence, diagnosis: Diagnosis) -> None:
     if stats.restarts:
         add(Kind.RESTARTED, restarts=stats.restarts, causes=board.reset_cause)
     made = stats.scans + stats.missed
-    # Too few scans to look at are a loss, too, unless restarts say why they are few.
-    if stats.missed > evidence.loss * made or (len(evidence.scans) < 2 and not stats.restarts):
+    # Too few scans to look at are a loss, too, unless something says why they are few.
+    few = len(evidence.scans) < 2 and not (stats.restarts or evidence.lost)
+    if stats.missed > evidence.loss * made or few:
         add(
             Kind.LOSS,
             received=len(evidence.scans),

@@ -44,7 +44,7 @@ class Kind(Enum):
     PORT_UNUSABLE = "port_unusable", _FAULT, "port problem remedy"
     NOTHING_ANSWERS = "nothing_answers", _FAULT, "port problem remedy"
     PROTOCOL_MISMATCH = "protocol_mismatch", _FAULT, "port problem remedy"
-    LOST = "lost", _FAULT, "problem"
+    LOST = "lost", _FAULT, "problem late"
     SELF_TEST = "self_test", _FAULT, "name code_min code_max"
     NOTHING_CONDUCTS = "nothing_conducts", _FAULT, "one_cell"
     OPEN_ROW = "open_row", _FAULT, "line_count cells_per_line"
