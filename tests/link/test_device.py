@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin.emulate.driver import EmulatorLink, SteppedSkin
+from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.emulate.urls import emulated
 from ohmskin.errors import CommandRefused, DeviceLost, PortError
@@ -424,6 +424,35 @@ def test_latest_waits_as_long_as_told() -> None:
         assert skin.now_s == pytest.approx(0.9)
         skin.step(0.2)
         assert skin.latest(timeout_s=10).number == 0
+
+
+class HelloEaterLink(SteppedLink):
+    """Loses the next hello of its board, as a line that damages a frame does."""
+
+    eats = False
+
+    def read(self, limit_s: float = 0.1) -> bytes:
+        octets = super().read(limit_s)
+        frames = framing.Decoder().feed(octets)
+        hellos = [raw for raw in frames if raw.type == protocol.FRAMES["hello"].id]
+        if not (self.eats and hellos):
+            return octets
+        self.eats = False
+        left = (raw for raw in frames if raw is not hellos[0])
+        return b"".join(framing.encode(raw.type, raw.sequence, raw.payload) for raw in left)
+
+
+def test_what_a_board_keeps_is_asked_again_if_its_hello_is_lost() -> None:
+    """Its answer came, so the hello of before was taken for what it now keeps."""
+    link = HelloEaterLink(emulated("emulator://8x8")[0])
+    skin = SteppedSkin(link)
+    skin.start()
+    link.eats = True
+    assert skin.set_region(device.Region([3], [4])).row_mask == 1 << 3
+    link.eats = True
+    assert skin.configure(rows=4, rate_hz=50).rows == 4
+    assert not link.eats
+    assert skin.latest().rows == 4  # its scans contradicted the hello, which ended the session
 
 
 def test_two_threads_close_a_port_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -380,8 +380,15 @@ class Device(Closing):
         """Do a command; it is done on return. Raises CommandRefused, DeviceLost."""
 
     def _refresh(self) -> Hello:
-        """Ask for `hello`. It comes before the answer to the command, so `info` is new then."""
-        self._command("get_hello")
+        """Ask for `hello`. It comes before the answer to the command, so `info` is new then.
+
+        Where it is not, the line has lost the hello alone: it is asked for again.
+        """
+        for _ in range(COMMAND_TRIES):
+            before = self._hello
+            self._command("get_hello")
+            if self._hello is not before:
+                break
         return self.info
 
     def _check_unit(self, hello: Hello) -> None:
