@@ -82,6 +82,14 @@ def test_a_contact_that_is_new_in_a_region_is_looked_at_by_a_whole_scan() -> Non
     assert (asked[-1].rows, asked[-1].mode) == (None, "near")
     focus.follow(touched((3, 4), (3, 6)), 2, whole)
     assert (asked[-1].columns, asked[-1].mode) == (range(3, 8), "near")
+    # Three touches outside that close a rectangle show as a cross. A finger that moves along one of
+    # the layers is followed.
+    cross = touched((3, 4), (3, 5), (2, 4), (4, 4))
+    for cells, rows in ((touched((3, 4)), range(2, 5)), (cross, None), (cross, range(1, 6))):
+        focus.follow(cells, 1, some if rows is None else whole)
+        assert asked[-1].rows == rows
+    focus.follow(touched((2, 4), (6, 4)), 1, some)
+    assert asked[-1].rows == range(1, 8)
 
 
 @pytest.mark.parametrize("settle_us", [0, 20])

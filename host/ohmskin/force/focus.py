@@ -3,7 +3,9 @@
 
 A region of a few lines is read several times as often as the whole skin. It does not show a touch
 that is elsewhere, so whole scans come in between, `WHOLE_HZ` times a second. And a new touch in a
-region may be the ghost of touches outside, so the scan after it is a whole one.
+region may be the ghost of touches outside, so the scan after it is a whole one. So it is where
+touches seem to grow along rows and columns at once: three touches outside, at the other corners of
+a rectangle, make a touch look harder, and so do lines beside it.
 """
 
 import threading
@@ -86,7 +88,7 @@ class Focus(Closing):
         """
         is_new, self._contact_count = contact_count > self._contact_count, contact_count
         lines = wanted_lines(touched, self._lines)
-        if is_new and not scan.is_whole:
+        if not scan.is_whole and (is_new or _has_grown(lines, self._lines)):
             lines = None
         with self._lock:
             if lines != self._lines and not self._closed:
@@ -147,6 +149,13 @@ def wanted_lines(touched: Bool, before: Lines | None) -> Lines | None:
         for now, needed in zip(before, least, strict=True)
     )
     return before if all(stays) else least
+
+
+def _has_grown(lines: Lines | None, before: Lines | None) -> bool:
+    """Whether both rows and columns are needed that were not read before."""
+    if lines is None or before is None:
+        return False
+    return all({*new} - {*old} for new, old in zip(lines, before, strict=True))
 
 
 def _around(touched: Bool) -> range:
