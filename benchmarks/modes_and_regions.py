@@ -38,7 +38,7 @@ _RATES: tuple[dict[str, dict[str, Any]], ...] = (
         "region_3x3_quick_hz": _CELLS | {"mode": "quick", "rate_mhz": 1_700_000},
         "region_3x3_half_hz": _CELLS | {"mode": "half", "rate_mhz": 1_200_000},
         "region_3x3_quick_whole10_hz": _CELLS
-        | {"mode": "quick", "rate_mhz": 1_700_000, "whole_mode": "quick", "whole_every": 160},
+        | {"mode": "quick", "rate_mhz": 1_700_000, "whole_mode": "quick", "whole_every": 156},
     },
 )
 
