@@ -145,9 +145,12 @@ def test_a_region_that_a_program_has_left_is_said_and_can_be_ended(
     path = pty_board("emulator://4x6").path
     with ohmskin.open(path) as skin:
         skin.set_region(Region([1, 2], [0, 1, 5], mode="near", whole_every=30))
-    said = "rows 1 2, columns 0 1 5; 'ohmskin configure PORT --rows 4 --columns 6' ends that"
     page = well(run("info", path)).out
-    assert f" {said}; one scan in 30 is of all, in mode near" in page
+    assert " rows 1 2, columns 0 1 5; one scan in 30 is of all, in mode near" in page
+    assert (
+        "not all cells are scanned: 'ohmskin configure PORT --rows 4 --columns 6' changes that"
+        in page
+    )
     done = well(run("configure", path, "--rate", "90")).out
     assert "4x6, a region of it (see 'ohmskin info'), at 90.00 Hz" in done
     with (

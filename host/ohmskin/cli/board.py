@@ -114,6 +114,9 @@ def info(
         none = "none" if all_came else "none, but other readings came too late to be judged"
         table.add_row("findings", ", ".join(findings) or none)
     TERMINAL.print(table)
+    if not board.is_whole:
+        size = f"--rows {board.rows} --columns {board.columns}"
+        TERMINAL.print(f"not all cells are scanned: 'ohmskin configure PORT {size}' changes that")
     for finding in findings:
         doc = ENUMS["finding"].docs.get(finding, "a finding of a newer firmware")
         TERMINAL.print(Text(finding, "red") + f": {doc}")
@@ -126,9 +129,7 @@ def _board_in_words(board: Hello) -> dict[str, str]:
     rate = f"{1e-3 * board.rate_asked_mhz:.2f} Hz" if board.rate_asked_mhz else "the fastest"
     rows = " ".join(map(str, lines_of(board.row_mask, board.rows)))
     columns = " ".join(map(str, lines_of(board.column_mask, board.columns)))
-    size = f"--rows {board.rows} --columns {board.columns}"
-    region = f"rows {rows}, columns {columns}; 'ohmskin configure PORT {size}' ends that"
-    region = "all cells" if board.is_whole else region
+    region = "all cells" if board.is_whole else f"rows {rows}, columns {columns}"
     if board.whole_every:
         region += f"; one scan in {board.whole_every} is of all, in mode {board.whole_mode}"
     us = board.settle_asked_us

@@ -536,7 +536,8 @@ def mean_ratio(scans: Iterable[Scan]) -> Float:
     """
     whole = [scan for scan in scans if scan.is_whole]
     if not whole:
-        raise DeviceLost("the port gives no more scans, or none of all cells: scan them all")
+        remedy = "'ohmskin info PORT' says which cells are scanned"
+        raise DeviceLost("the port gives no more scans, or none of all cells", remedy)
     last = next((scan for scan in reversed(whole) if scan.is_complete), whole[-1])
     alike = [scan.ratio for scan in whole if scan.kind == last.kind]
     return np.asarray(np.mean(alike, axis=0))
