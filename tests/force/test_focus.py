@@ -176,6 +176,9 @@ def test_the_port_is_given_back_whatever_the_skin_has_become() -> None:
 def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="only near ends"):
         Focus(stepped("emulator://8x8?mode=far"))
+    for like in (Region(mode="far"), Region(whole_mode="far"), Region(mode="bad")):
+        with pytest.raises(ValueError, match=r"mode near, half or quick, not (far|bad)"):
+            Focus(stepped("emulator://8x8"), like)  # it was refused when the first touch came
     board = stepped("emulator://4x4")
     with Recorder(tmp_path / "a.mcap", board.info, lambda: board.now_s) as recorder:
         record(board, recorder, scans_for(board, 0.1))

@@ -16,10 +16,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ohmskin.arrays import Bool
+from ohmskin.circuit.configurations import is_near
 from ohmskin.errors import OhmskinError
 from ohmskin.files import Closing
 from ohmskin.link.device import Device, Region
 from ohmskin.link.messages import Scan
+from ohmskin.link.protocol import MODES
 
 # Whole scans come at least so often [Hz]. Chosen: a new touch is seen within a tenth of a second,
 # even if it comes just after a whole scan; this includes the time of the scan, of its way to the
@@ -59,7 +61,7 @@ class Focus(Closing):
 
     :raises CommandRefused: the board has no regions, or is a recording.
     :raises DeviceLost: the board does not answer.
-    :raises ValueError: the board reads far ends, which no region shows.
+    :raises ValueError: the board reads far ends, which no region shows, or `like` says so.
     """
 
     def __init__(self, device: Device, like: Region = FOLLOWING) -> None:
@@ -73,6 +75,9 @@ class Focus(Closing):
         self._before = Region.of(device.info)
         if device.info.reads_far:
             raise ValueError("only near ends can be followed: 'ohmskin configure PORT --mode near'")
+        for mode in (like.mode, like.whole_mode):
+            if mode not in MODES or not is_near(MODES[mode]):
+                raise ValueError(f"contacts are followed in mode near, half or quick, not {mode}")
         # How long a scan of a region takes for each of its cells, and a whole scan [s].
         self._cell_s = self._whole_s = 0.0
         self._ask(None)
