@@ -14,7 +14,7 @@ from ohmskin.estimate import cells_at_rest
 from ohmskin.estimate.base import Estimate
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 from ohmskin.estimate.methods import make_estimator
-from studies.trials import Trial, random_trial, trial_of
+from studies.trials import NOMINAL_WIRE_OHM, Trial, random_trial, trial_of
 
 LONG = (500.0, 1000.0)  # ohm a segment
 
@@ -94,19 +94,22 @@ def test_what_segments_differ_by_is_no_part_of_a_force() -> None:
 
 
 def pressed_before_and_after(
-    method: str, told: WireOhm, lead_ohm: float = 0.0
+    method: str,
+    told: WireOhm,
+    lead_ohm: float = 0.0,
+    wire_ohm: tuple[float, float] = LONG,
 ) -> tuple[list[Estimate], list[Estimate], list[Estimate]]:
     """Three cells, each pressed alone: at first, after many touches, and in a session after that.
 
     The later session knows the wires that the first one has learned.
     """
     cells = [(3, 3), (2, 1), (0, 3)]
-    drawn = random_trial(4, 4, 4, 40, seed=1, wire_ohm=LONG)
+    drawn = random_trial(4, 4, 4, 40, seed=1, wire_ohm=wire_ohm)
     rest, *frames = (
         replace(skin, lead_ohm=np.full(8, lead_ohm)) for skin in (drawn.rest, *drawn.frames)
     )
     alone = [pressed(rest, cell) for cell in cells]
-    given = trial_of(rest, [*alone, *frames, *alone], LONG).rounded(10)
+    given = trial_of(rest, [*alone, *frames, *alone], wire_ohm).rounded(10)
     known = replace(given.knowledge(0), nominal_wire_ohm=told)
     estimator = make_estimator(method, known)
     answers = [estimator.estimate(ratio) for ratio in given.ratio]
@@ -146,6 +149,27 @@ def test_a_lead_that_no_press_has_measured_is_in_no_curve(method: str) -> None:
         assert found.level[cell] == pytest.approx(found.cell_siemens[cell], rel=0.1)
 
 
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_a_lead_that_presses_took_for_too_long_is_no_part_of_a_force(method: str) -> None:
+    """Where contacts saturate: presses show nothing but the sum of that and of both leads."""
+    told = WireOhm(*NOMINAL_WIRE_OHM, 400.0, 0.05, 0.05, 140.0)
+    three = pressed_before_and_after(method, told, 80.0, NOMINAL_WIRE_OHM)
+    for cell, first, late, anew in zip([(3, 3), (2, 1), (0, 3)], *three, strict=True):
+        assert late.cell_siemens[cell] < 0.8 * first.cell_siemens[cell]
+        assert late.level[cell] == pytest.approx(first.level[cell], rel=0.15)
+        assert anew.level[cell] == pytest.approx(first.level[cell], rel=0.15)
+
+
+def test_a_measured_lead_changes_as_far_as_layers_do() -> None:
+    """It does not stretch, but where layers are stretched frames take some of that for lead."""
+    told = WireOhm(100.0, 200.0, 600.0, 0.0, 0.0, 40.0)
+    # Segments differ by 10 %, which is 30 ohm of both layers.
+    assert told.of_curves((100.0, 200.0, 500.0)) == pytest.approx((100.0, 200.0, 564.0))
+    assert told.of_curves((600.0, 700.0, 700.0))[2] == pytest.approx(700.0, abs=1.0)
+    # Layers that change against each other are not stretched.
+    assert told.of_curves((150.0, 150.0, 500.0))[2] == pytest.approx(564.0)
+
+
 def test_what_a_skin_is_stretched_by_is_no_part_of_a_level() -> None:
     """Wires that were well known when cells were pressed, and have doubled since."""
     trial = random_trial(4, 4, 4, 40, seed=1, wire_ohm=LONG)
@@ -173,8 +197,8 @@ def test_a_region_leaves_the_levels_of_other_cells_as_they_were() -> None:
 
 
 def test_wires_that_are_learned_twice_are_still_those_of_the_curves() -> None:
-    told = WireOhm(100.0, 200.0, 80.0, 0.3, 0.3, 50.0)
-    once = WireOhm(144.0, 200.0, 200.0, 0.3, 0.3, 10.0).for_curves_of(told)
+    told = WireOhm(100.0, 200.0, 80.0, 0.3, 0.3)
+    once = WireOhm(144.0, 200.0, 200.0, 0.3, 0.3).for_curves_of(told)
     # Half of the change was there when they were told: by a deviation of 0.3, as of stretch.
     assert once[6:] == pytest.approx((120.0, 200.0, 140.0))
     twice = WireOhm(144.0, 450.0, 90.0, 0.1, 0.1, 5.0).for_curves_of(once)

@@ -24,6 +24,7 @@ from ohmskin.circuit.configurations import (
 from ohmskin.estimate.prior import (
     LAYER_STD,
     LEAD_STD,
+    SEGMENT_STD,
     UNKNOWN_LEAD_OHM,
     UNKNOWN_WIRE_OHM,
     USUAL_LEAD_STD_OHM,
@@ -124,15 +125,21 @@ class WireOhm(NamedTuple):
         """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
 
         A press alone shows a cell and the wires up to it as one. So what wires were told wrongly by
-        is in the curves of cells. What the skin was stretched by since is not.
+        is in the curves of cells. What the skin was stretched by since is not. A lead does not
+        stretch, but frames take for lead some of what layers have changed by, or single segments
+        differ by. Against that, a measured lead was told wrongly by its own deviation.
         """
-        left, layers = 1.0 - self.told_share, []
+        left, layers, change_ohm = 1.0 - self.told_share, [], 0.0
         for told, curve, ohm in zip(self[:2], self[6:8], now, strict=False):
             told_ohm = max(UNKNOWN_WIRE_OHM if told is None else told, LEAST_WIRE_OHM)
             curve_ohm = told_ohm if curve is None else max(curve, LEAST_WIRE_OHM)
             layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** left)
+            change_ohm += ohm - told_ohm
         told_ohm, _ = self.lead_or_usual(0.0)
         curve_ohm = told_ohm if self.curve_lead is None else self.curve_lead
+        if self.both and self.lead_std_ohm:
+            of_layers = change_ohm**2 + (SEGMENT_STD * sum(self.both)) ** 2
+            left *= of_layers / (of_layers + self.lead_std_ohm**2)
         return layers[0], layers[1], max(curve_ohm + left * (now[2] - told_ohm), 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
