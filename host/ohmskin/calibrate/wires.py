@@ -25,9 +25,9 @@ H        (n,)   cell, and that cell alone
 S        (n,)   dy / d log G                                                              1
 U        (n,)   dy / d ohm, of what is in series with the whole port                      1/ohm
 K        (c, c) covariance of what is in series with the c pressed cells: segments and    ohm^2
-                leads differ from their means by `SEGMENT_STD`, r by `SERIES_SPREAD`
+                leads differ from their means by `SEGMENT_STD`, r by v_series
 v               variances of log G: of a cell's factor, of its exponent, of a press, of   1
-                a row; and that of a force [N^2]
+                a row; and that of a force [N^2], and of a cell's r as a share of it
 C        (n, n) covariance of y                                                           1
 ======== ====== ========================================================================= =======
 
@@ -92,17 +92,15 @@ UNTOLD_STD: Final = 1.5
 UNTOLD_LEAD_STD_OHM: Final = 1500.0
 # r [ohm], that of the cell in docs/force.md, and the deviation of its log. Chosen: a factor of e.
 SERIES_OHM, SERIES_STD = 250.0, 1.0
-# r differs from cell to cell by this share. Chosen: as a cell's factor does (`SCATTER`).
-SERIES_SPREAD: Final = 0.2
 # Exponent b: linear contacts have 1, rough ones up to 2. Chosen.
 EXPONENT, EXPONENT_STD = 1.5, 1.0
 # Bend q. Chosen: from 0.4 to 8 N, it changes the exponent by 0.3.
 BEND_STD: Final = 0.1
 # The roots of v before any press: of a cell's factor, of its exponent, of a press and of a row, all
-# of log G; and of a force [N]. Then the deviations of the logs of these roots. Chosen: cells of one
-# skin scatter by some ten percent, presses by less.
-SCATTER: Final[Float] = np.array([0.2, 0.03, 0.05, 0.08, 0.03])
-SCATTER_LOG_STD: Final[Float] = np.array([0.5, 0.7, 1.0, 1.0, 1.0])
+# of log G; of a force [N]; and of a cell's r. Then the deviations of the logs of these roots.
+# Chosen: cells of one skin scatter by some ten percent, presses by less.
+SCATTER: Final[Float] = np.array([0.2, 0.03, 0.05, 0.08, 0.03, 0.2])
+SCATTER_LOG_STD: Final[Float] = np.array([0.5, 0.7, 1.0, 1.0, 1.0, 1.0])
 
 # Wires are unclear if the deviation of their log is larger, and if that matters (`FoundWires`).
 # Chosen: a factor of 1.6.
@@ -192,12 +190,13 @@ class _Trial(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """y of the model, S and U, (n,); K (c, c)."""
+    """y of the model, S and U, (n,); K without r, (c, c); r [ohm]."""
 
     y: Float
     by_contact: Float
     by_path: Float
     path_variance: Float
+    series_ohm: float
 
 
 @one_blas_thread
@@ -348,8 +347,10 @@ class _PressFit:
         log_contact = p[3] + p[4] * self._x + p[5] * self._bend
         rest_current = 1.0 / trial.rest_ohm
 
+        series_ohm = float(np.exp(p[6]))
+
         def y(log_siemens: Float) -> tuple[Float, Float]:
-            added_ohm = np.exp(p[6]) + np.exp(-log_siemens)
+            added_ohm = series_ohm + np.exp(-log_siemens)
             missing = trial.square_volt / (added_ohm + trial.cell_volt)
             current = 1.0 / np.maximum(trial.rest_ohm - missing, 1.0)
             return np.log(np.maximum(current - rest_current, 1e-15)), current
@@ -357,15 +358,15 @@ class _PressFit:
         middle, current = y(log_contact)
         half = 0.5 * SEGMENT_STD
         by_contact = (y(log_contact + half)[0] - y(log_contact - half)[0]) / (2 * half)
-        own = (SERIES_SPREAD * np.exp(p[6])) ** 2 * np.eye(self._cells.size)
         # U: d(I - I0) / d ohm = I0^2 - I^2, so that d log(I - I0) / d ohm = -(I + I0).
-        return _Expected(middle, by_contact, -(current + rest_current), trial.path_variance + own)
+        by_path = -(current + rest_current)
+        return _Expected(middle, by_contact, by_path, trial.path_variance, series_ohm)
 
     def _whitener(self, model: _Expected, scatter: Float) -> "_Whitener":
-        """Whitens residuals of y at this model. scatter: roots of v, (5,)."""
+        """Whitens residuals of y at this model. scatter: roots of v, (6,)."""
         block, is_row, rows = self._block, self._is_row, self._rows
         x, press = self._x[block], rows.press[block]
-        cell, exponent, of_press, of_row, of_force = scatter**2
+        cell, exponent, of_press, of_row, of_force, of_series = scatter**2
         covariance = cell + exponent * x[:, :, None] * x[:, None]
         covariance += of_press * (press[:, :, None] == press[:, None])
         own = of_row + of_force * np.exp(-2 * rows.log_force[block])
@@ -375,7 +376,8 @@ class _PressFit:
         covariance *= slope[:, :, None] * slope[:, None]
         diagonal += np.where(is_row, rows.variance[block] + 1e-12, 1.0)
         by_path = np.where(is_row, model.by_path[block], 0.0)
-        return _Whitener(np.linalg.cholesky(covariance), by_path, model.path_variance)
+        of_path = model.path_variance + of_series * model.series_ohm**2 * np.eye(self._cells.size)
+        return _Whitener(np.linalg.cholesky(covariance), by_path, of_path)
 
     # ----------------------------------------------------------------------------- the search
 
@@ -430,7 +432,7 @@ class _PressFit:
         return np.asarray(approx_fprime(p, self._residual, _DIFFERENCE, whitener))
 
     def _scatter(self, p: Float, scatter: Float) -> tuple[Float, float]:
-        """The scatter (5,) of most likelihood at p, and -2 log of that likelihood."""
+        """The scatter (6,) of most likelihood at p, and -2 log of that likelihood."""
         from scipy.optimize import minimize
 
         model = self._expected(p)
