@@ -213,10 +213,10 @@ class Calibration:
     def level(self, estimate: Estimate) -> tuple[Float, Float]:
         """What the forces of a frame are read from, and its deviation, (R, C).
 
-        It is `Estimate.level`, with one exception. The curve of a cell has wires in it that presses
-        do not show: the hidden ones. The curve of all presses has those of the pressed cells, on
-        average. So for a cell without a curve of its own, the mean of the cells that have one takes
-        the place of its own hidden wires; if no cell has one, the mean of all.
+        It is `Estimate.level`, with one exception. The curve of a cell has wires in it that its
+        presses do not show: the hidden ones. The curve of all presses has those of the pressed
+        cells, on average. So for a cell of which presses tell next to nothing (`pooled`), the mean
+        of the others takes the place of its own hidden wires; if there are no others, that of all.
         """
         level, level_std, pooled = estimate.level, estimate.level_std, self.model.pooled
         if not estimate.wires or not pooled.any():
