@@ -191,7 +191,7 @@ def test_cells_are_chosen_by_keyboard_and_read_as_a_table(page: Any) -> None:
     cells.press("ArrowUp")
     for _ in range(3):
         cells.press("ArrowRight")
-    has_text(panel, ".said", r"cell \(2, 5\): 1\.2\d ± 0\.0\d N")
+    has_text(panel, ".said", r"cell \(2, 5\): 1\.2\d ± 0\.1\d N")
     switch(panel, "Raw reading")
     panel.locator(".raw .cells").click(position={"x": 25, "y": 25})
     has_text(panel, ".chosen", r"\(0, 0\)")
@@ -199,7 +199,7 @@ def test_cells_are_chosen_by_keyboard_and_read_as_a_table(page: Any) -> None:
     has_text(panel, ".values caption", r"force \[N\]")
     table = panel.locator(".values tbody tr")
     assert table.count() == 8
-    assert re.match(r"1\.2\d ± 0\.0\d N", table.nth(2).locator("td").nth(5).inner_text())
+    assert re.match(r"1\.2\d ± 0\.1\d N", table.nth(2).locator("td").nth(5).inner_text())
 
 
 def test_a_force_below_its_deviation_is_a_word(page: Any) -> None:
@@ -209,7 +209,7 @@ def test_a_force_below_its_deviation_is_a_word(page: Any) -> None:
     rows = panel.locator(".contacts tbody tr").all_inner_texts()
     amounts = {line.split("\t")[1]: line.split("\t")[2] for line in rows}
     assert amounts["2.0, 2.0"] == amounts["5.0, 2.0"] == "uncertain"
-    assert re.fullmatch(r"1\.2\d ± 0\.0\d N", amounts["2.0, 5.0"])
+    assert re.fullmatch(r"1\.2\d ± 0\.1\d N", amounts["2.0, 5.0"])
     has_text(panel, ".chosen", r"\(2, 2\)")
     has_text(panel, ".value", "^uncertain$")
     switch(panel, "Table")
