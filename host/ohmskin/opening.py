@@ -93,10 +93,14 @@ def _device(text: str) -> Device:
                 if url.scheme and urlsplit(text).port is None:
                     raise ValueError(f"which of its ports? Write {url.scheme}://{url.place}:4000")
             return Session(SerialLink(text.partition("?")[0]), baud)
-        case "emulator" | "simavr" as kind:
-            from ohmskin.emulate import urls
+        case "emulator":
+            from ohmskin.emulate.urls import open_emulator
 
-            return urls.open_emulator(text) if kind == "emulator" else urls.open_simavr(text)
+            return open_emulator(text)
+        case "simavr":
+            from ohmskin.emulate.urls import open_simavr
+
+            return open_simavr(text)
         case "replay":
             from ohmskin.record.replay import Replay
 

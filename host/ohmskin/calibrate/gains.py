@@ -112,8 +112,7 @@ def find_gains(
     error_n = force_n - held_out_n
     (f_ff, c_ff), (f_fr, c_fr) = map(sums, (held_out_n**2, held_out_n * error_n))
     others = q * (c_fr[of_press] - f_fr) / (1 + q * (c_ff[of_press] - f_ff))
-    (_, square), (_, weight) = map(
-        sums, ((error_n - others[of_row] * held_out_n) ** 2, np.ones_like(force_n))
-    )
-    square = np.where(weight > 0, square / np.maximum(weight, 1e-9), np.mean(error_n**2))
-    return Gains(gain, s * np.sqrt(q / (1 + q * ff)), s, np.sqrt(square))
+    left_n = error_n - others[of_row] * held_out_n
+    rows, square = np.bincount(cell, minlength=cells), np.bincount(cell, left_n**2, cells)
+    mean_square = np.where(rows > 0, square / np.maximum(rows, 1), np.mean(error_n**2))
+    return Gains(gain, s * np.sqrt(q / (1 + q * ff)), s, np.sqrt(mean_square))

@@ -25,7 +25,7 @@ H        (n,)   cell, and that cell alone
 S        (n,)   dy / d log G                                                              1
 U        (n,)   dy / d ohm, of what is in series with the whole port                      1/ohm
 K        (c, c) covariance of what is in series with the c pressed cells: segments and    ohm^2
-                leads differ from their means by `SEGMENT_STD`, r by v_series
+                leads differ from their means by `SEGMENT_STD`, r by its v
 v               variances of log G: of a cell's factor, of its exponent, of a press, of   1
                 a row; and that of a force [N^2], and of a cell's r as a share of it
 C        (n, n) covariance of y                                                           1

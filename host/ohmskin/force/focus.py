@@ -3,9 +3,9 @@
 
 A region of a few lines is read several times as often as the whole skin. It does not show a touch
 that is elsewhere, so whole scans come in between, `WHOLE_HZ` times a second. And a new touch in a
-region may be the ghost of touches outside, so the scan after it is a whole one. So it is where
-touches seem to grow along rows and columns at once: three touches outside, at the other corners of
-a rectangle, make a touch look harder, and so do lines beside it.
+region may be the ghost of touches outside. So may a touch that seems to grow along rows and columns
+at once, as three touches outside let it, at the other corners of a rectangle. In both cases, the
+next scan is a whole one.
 """
 
 import threading
