@@ -443,7 +443,7 @@ class FewTouches:
         # Where wires matter, S^-1 weighs the readings; elsewhere their noise does, which is cheap.
         heavy = self._moved_by_wires()
         ports, light = np.flatnonzero(heavy), ~heavy
-        wires = self._sharpen(ports)  # W
+        wires, drift_ohm = self._sharpen(ports)  # W
         factor = cholesky(gram(wires, onto=np.eye(ports.size, order="F")))  # of S
         # The network was solved with the mean wires that the prior is about. `offset` is how the
         # means that are believed now change these residuals, to first order.
@@ -485,8 +485,10 @@ class FewTouches:
             by_ohm = (self._current[ports] ** 2 / self._std[ports])[:, None]
             odd_leads = belief.odd_lead_ohm() * by_ohm * belief.leads_of_ports[ports]
             own = wires[:, : -len(belief.means)]
-            noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads, own])
-            unlimited = cholesky(gram(noise, onto=np.eye(ports.size, order="F")))
+            # Cells that drift move several ports alike: so here, s^2 is taken apart again.
+            noise = np.hstack([UNLIMITED_STD * heavy_slopes.T, odd_leads, own, by_ohm * drift_ohm])
+            of_readings = (self._reading_std[ports] / self._std[ports]) ** 2
+            unlimited = cholesky(gram(noise, onto=np.diag(of_readings)))
             return Lesson(by_mean_std, residual, unlimited)
 
         return self._answer(covariance_of_cells, np.abs(by_means), modelled, teach)
@@ -527,8 +529,8 @@ class FewTouches:
         heavy[self.cells] = True
         return heavy
 
-    def _sharpen(self, ports: Cells) -> Float:
-        """Make s anew at m ports. Returns W at these.
+    def _sharpen(self, ports: Cells) -> tuple[Float, Float]:
+        """Make s anew at m ports. Returns W at these, and what cells that drift move rho by.
 
         There, s has the noise of the readings and the drift of cells at rest as the
         touched network shows it. It no longer has the wires, because these are in S.
@@ -540,4 +542,4 @@ class FewTouches:
         self._untouched_std[ports] = np.sqrt(self._reading_std[ports] ** 2 + model_variance)
         self._compare()
         by_wire *= -(square / self._std[ports])[:, None]
-        return by_wire
+        return by_wire, by_cell
