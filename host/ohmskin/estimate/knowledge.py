@@ -4,6 +4,7 @@
 Estimators, and the modules that prepare readings for them, are told a `SkinKnowledge`.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -39,6 +40,12 @@ MIN_CELL_SIEMENS: Final = 1e-9
 # Chosen: usual resistors are within 1 % (E96), and the pins that drive them add less than that:
 # some 30 ohm to 30 kOhm.
 REF_LOG_STD: Final = 0.01
+# Deviation that all segments share, of a skin that has not been bent since its wires were told:
+# temperature, wear. And the odds that it has not. Chosen: behind wires of some hundred ohms, forces
+# are 15 % better where it has not been, 15 % worse where wires are 5 to 10 % shorter, and as good
+# where they are 30 % longer or shorter.
+STILL_STD: Final = 0.02
+STILL_ODDS: Final = 0.3
 # Wires of less count as so much [ohm]. Chosen: its log is finite, and no reading shows it.
 LEAST_WIRE_OHM: Final = 1e-3
 # A shorted cell counts as so much [S]. Chosen: beside references of 30 kOhm, an ohm is nothing.
@@ -105,21 +112,27 @@ class WireOhm(NamedTuple):
             better = better._replace(lead=found.lead, lead_std_ohm=found.lead_std_ohm)
         return better.for_curves_of(self)
 
-    @property
-    def told_share(self) -> float:
-        """How much of what wires differ from these by was so when they were told [1].
+    def told_share(self, top_ohm: float, bottom_ohm: float) -> float:
+        """How much of what wires differ from these was so when they were told, if they are now so.
 
         Wires differ because they were told wrongly, by the deviations of the layers, or because the
-        skin has been stretched since, by `LAYER_STD`. It is one number for layers and lead: frames
-        show whole paths better than which part of a path is long. A skin is stretched as a whole,
-        and presses that take too much for the lead take too little for both layers: so either adds
-        up over the layers. What has no deviation counts as told rightly, as no press measured it.
+        skin has been stretched since: by `STILL_STD`, or, if it has been bent, by `LAYER_STD`. By
+        their sizes, a small change was more likely told wrongly, and a large one is stretch.
+
+        It is one share for layers and lead: frames show whole paths better than which part of a
+        path is long. A skin is stretched as a whole, and presses that take too much for the lead
+        take too little for both layers: so either adds up over the layers. What has no deviation
+        counts as told rightly, as no press measured it.
         """
         if self.both is None:
             return 0.0
         top, bottom = (max(ohm, LEAST_WIRE_OHM) for ohm in self.both)
-        off_ohm = top * (self.top_log_std or 0.0) + bottom * (self.bottom_log_std or 0.0)
-        return off_ohm**2 / (off_ohm**2 + (LAYER_STD * (top + bottom)) ** 2)
+        told_ohm = top * (self.top_log_std or 0.0) + bottom * (self.bottom_log_std or 0.0)
+        still, bent = (told_ohm**2 + (std * (top + bottom)) ** 2 for std in (STILL_STD, LAYER_STD))
+        change_ohm = top_ohm - top + bottom_ohm - bottom
+        odds = STILL_ODDS * math.sqrt(bent / still)
+        odds *= math.exp(0.5 * change_ohm**2 * (1 / bent - 1 / still))
+        return told_ohm**2 * (odds / still + 1 / bent) / (odds + 1)
 
     def of_curves(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
         """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
@@ -129,7 +142,7 @@ class WireOhm(NamedTuple):
         stretch, but frames take for lead some of what layers have changed by, or single segments
         differ by. Against that, a measured lead was told wrongly by its own deviation.
         """
-        left, layers, change_ohm = 1.0 - self.told_share, [], 0.0
+        left, layers, change_ohm = 1.0 - self.told_share(*now[:2]), [], 0.0
         for told, curve, ohm in zip(self[:2], self[6:8], now, strict=False):
             told_ohm = max(UNKNOWN_WIRE_OHM if told is None else told, LEAST_WIRE_OHM)
             curve_ohm = told_ohm if curve is None else max(curve, LEAST_WIRE_OHM)
