@@ -167,7 +167,7 @@ class LearnedWires(WireBelief):
         moved = np.abs(self._known.means - before)[:3]
         moves = moved > [LARGE_MOVE_LOG, LARGE_MOVE_LOG, USUAL_LEAD_STD_OHM]
         # Under fingertips, more fits take long on large skins, and gain nothing.
-        return bool(moves.any()) and (tip_log is None or not again)
+        return bool(moves.any()) and tip_log is None
 
     def take(self, lesson: Lesson, *, replace_last: bool = False) -> None:
         """One Kalman step.
