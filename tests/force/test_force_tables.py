@@ -196,6 +196,13 @@ def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: R
     assert (out / "a.npz").read_bytes()[:2] == b"PK"
     with np.load(out / "a.npz") as one, np.load(out / "b.npz") as other:
         np.testing.assert_array_equal(one["force_n"], other["force_n"])
+    # One that cannot be read does not keep the others from being exported.
+    (bad := tmp_path / "bad.mcap").write_bytes(b"no recording")
+    (out / "b.npz").unlink()
+    done = run("export", str(bad), str(again), str(out), "--backend", "threading")
+    assert (done.code, "bad.mcap" in done.err) == (2, True)
+    assert "1 of 2 recordings were not exported" in done.err
+    assert [path.name for path in sorted(out.iterdir())] == ["a.npz", "b.npz"]
     done = run("export", str(recorded), str(again), str(tmp_path / "one.npz"))
     assert (done.code, "a folder takes several recordings" in done.err) == (2, True)
 

@@ -26,7 +26,7 @@ from ohmskin.cli.board import REF_STD, TERMINAL, Port, Scans, Seconds, asked_for
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_in_time, until_ctrl_c
-from ohmskin.errors import DeviceLost, OhmskinError
+from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
@@ -276,17 +276,36 @@ def export(
             def watch(size: int) -> None:
                 bar.update(task, completed=size)
 
-            done = [tables.export(*pairs[0], known, begin_s, end_s, watch, force=force)]
+            done: list[Part | str] = [
+                tables.export(*pairs[0], known, begin_s, end_s, watch, force=force)
+            ]
     else:
         done = _at_once(pairs, backend, known, begin_s, end_s, force=force)
     for (path, to), written in zip(pairs, done, strict=True):
+        if isinstance(written, str):
+            _errors.print(written, soft_wrap=True, highlight=False)
+            continue
         TERMINAL.print(f"{to}: {written.scans} scans")
         if written.cut_off:
             text = f"{path} was cut off: its last second may be missing"
             _errors.print(text, soft_wrap=True, highlight=False)
+    if failed := sum(isinstance(written, str) for written in done):
+        raise RecordingError(
+            f"{failed} of {len(pairs)} recordings were not exported, the others were"
+        )
 
 
-def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any, force: bool) -> list[Part]:
+def _one_of_many(path: Path, *told: Any, force: bool) -> Part | str:
+    """`tables.export`; or why it failed, because the other recordings are still wanted."""
+    try:
+        return tables.export(path, *told, force=force)
+    except (OhmskinError, ValueError) as exc:
+        return str(exc)
+
+
+def _at_once(
+    pairs: list[tuple[Path, Path]], backend: str, *told: Any, force: bool
+) -> list[Part | str]:
     """Each of these recordings to its file, by all cores, or by a cluster that joblib knows."""
     try:
         import joblib
@@ -298,7 +317,7 @@ def _at_once(pairs: list[tuple[Path, Path]], backend: str, *told: Any, force: bo
                 # That of the lab, which dask's own configuration names; else one of this machine.
                 stack.enter_context(Client(dashboard_address=None))
             stack.enter_context(joblib.parallel_config(backend))
-            jobs = (joblib.delayed(tables.export)(*pair, *told, force=force) for pair in pairs)
+            jobs = (joblib.delayed(_one_of_many)(*pair, *told, force=force) for pair in pairs)
             done = joblib.Parallel(n_jobs=-1, return_as="generator")(jobs)
             bar = stack.enter_context(_bar())
             return list(bar.track(done, total=len(pairs), description="recordings"))

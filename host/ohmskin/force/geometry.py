@@ -39,8 +39,8 @@ KINDS: Final = {
 # No cell is farther from the origin of its frame [m], and no pitch or radius is larger. Chosen:
 # robots are smaller.
 _FARTHEST_M: Final = 100.0
-# No cylinder is thinner [m]. Chosen: no textile bends round less.
-_LEAST_RADIUS_M: Final = 1e-4
+# No cylinder is thinner, and no cells are nearer [m]. Chosen: no textile bends round less.
+_LEAST_M: Final = 1e-4
 # A frame's name has at most so many characters. Chosen: names of links in URDF files are shorter.
 _LONGEST_NAME: Final = 100
 # A larger file of taxels is not read. Chosen: `MAX_CELLS` taxels with their meshes' names fit.
@@ -90,13 +90,15 @@ class Geometry:
         if self.kind == "table":
             return self.told["position_m"], self.told["normal"]
         across_m, along_m = self.told["pitch_m"]
+        if not np.abs(self.told["pitch_m"]).min() >= _LEAST_M:
+            raise ValueError(f"pitch_m holds a number that is not {_LEAST_M:g} or more")
         x, y = np.meshgrid(across_m * np.arange(self.columns), along_m * np.arange(self.rows))
         zero = np.zeros_like(x)
         if self.kind == "flat":
             return np.stack([x, y, zero], -1), np.stack([zero, zero, zero + 1], -1)
         radius_m = self.told["radius_m"]
-        if not radius_m >= _LEAST_RADIUS_M:
-            raise ValueError(f"radius_m is not above {_LEAST_RADIUS_M:g}")
+        if not radius_m >= _LEAST_M:
+            raise ValueError(f"radius_m is {radius_m:g}, it must be {_LEAST_M:g} or more")
         if np.ptp(x) >= 2 * np.pi * radius_m:
             around = f"{self.columns} columns of {across_m:g} m go round more than once"
             raise ValueError(f"radius_m is {radius_m:g}: {around}: a larger radius, or less pitch")

@@ -50,6 +50,8 @@ class Pad:
         self._site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
         if self._site < 0:
             raise ValueError(f"the model has no site '{site}'")
+        if spread_m is not None and not spread_m > 0:
+            raise ValueError(f"spread_m is {spread_m:g}, it must be above 0")
         geometry = required(calibration.geometry)
         self._model = model
         self._geoms = np.flatnonzero(model.geom_bodyid == model.site_bodyid[self._site])
