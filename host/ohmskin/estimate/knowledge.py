@@ -42,8 +42,8 @@ MIN_CELL_SIEMENS: Final = 1e-9
 REF_LOG_STD: Final = 0.01
 # Deviation that all segments share, of a skin that has not been bent since its wires were told:
 # temperature, wear. And the odds that it has not. Chosen: behind wires of some hundred ohms, forces
-# are 15 % better where it has not been, 15 % worse where wires are 5 to 10 % shorter, and as good
-# where they are 30 % longer or shorter.
+# are 15 % better where it has not been, 15 % worse where wires resist 5 to 10 % less, and as good
+# where they resist 30 % more or less.
 STILL_STD: Final = 0.02
 STILL_ODDS: Final = 0.3
 # Wires of less count as so much [ohm]. Chosen: its log is finite, and no reading shows it.
