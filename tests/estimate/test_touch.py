@@ -552,20 +552,21 @@ def test_frames_of_one_touch_do_not_teach_twice(method: str) -> None:
 
 
 def test_a_lesson_of_few_touches_errs_by_as_much_as_it_states() -> None:
-    """Cells at rest drift, and move several ports alike. As noise of each, it erred 2.4 times so.
+    """Cells at rest drift, and move several ports alike. As noise of each, it erred 2.5 times so.
 
-    By the node Laplacian, with wires as they are believed.
+    By the node Laplacian, with wires as they are believed, of which single segments differ.
     """
     random, shape, wires = np.random.default_rng(3), (8, 8), (50.0, 600.0)
     belief = LearnedWires(shape, WireOhm(*wires, 0.0))
     rest_log, by_means = np.full(64, -np.log(5e-6)), np.zeros((64, belief.means.size))
     prior = CellPrior(rest_log, np.full(64, REST_STD), by_means, belief.means)
-    finder, layers = SparseFit(prior, belief, 6e4), [np.full(shape, ohm) for ohm in wires]
+    finder, layers = SparseFit(prior, belief, 6e4), np.reshape(wires, (2, 1, 1))
     off_stds = []
     for _ in range(150):
         cells = np.exp(REST_STD * random.standard_normal(64) - rest_log)
         cells[random.choice(64, 4, replace=False)] = random.uniform(1e-4, 4e-4, 4)
-        skin = Skin(cells.reshape(shape), *layers)
+        wires_ohm = layers * np.exp(SEGMENT_STD * random.standard_normal((2, *shape)))
+        skin = Skin(cells.reshape(shape), *wires_ohm)
         ratio = ten_bits(SkinCircuit(skin).readings(skin.cell_siemens)[..., :4])
         few = finder.find(PortReader(told(ratio)).read(ratio))
         if few is not None and (touched := few.explain()):
@@ -575,4 +576,4 @@ def test_a_lesson_of_few_touches_errs_by_as_much_as_it_states() -> None:
             layer = whitened[:, :2]
             off_stds.append(whitened[:, 2] @ layer / np.linalg.norm(layer, axis=0))
     assert len(off_stds) > 100
-    np.testing.assert_allclose(np.sqrt(np.mean(np.square(off_stds), axis=0)), 1.0, atol=0.25)
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(off_stds), axis=0)), 1.0, atol=0.2)

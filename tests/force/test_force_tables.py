@@ -201,8 +201,9 @@ def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: R
     (out / "b.npz").unlink()
     done = run("export", str(bad), str(again), str(out), "--backend", "threading")
     assert (done.code, "bad.mcap" in done.err) == (2, True)
-    assert "1 of 2 recordings were not exported" in done.err
+    assert "not exported: 1 of 2 recordings" in done.err
     assert [path.name for path in sorted(out.iterdir())] == ["a.npz", "b.npz"]
+    assert_one_line(run(*words[:-2], "--format", "xyz"), "no format '.xyz'")
     done = run("export", str(recorded), str(again), str(tmp_path / "one.npz"))
     assert (done.code, "a folder takes several recordings" in done.err) == (2, True)
 

@@ -263,6 +263,8 @@ def export(
     is_folder, name_end = out.is_dir(), kind or ".npz"
     if not is_folder and kind not in ("", out.suffix):
         raise ValueError(f"--format {kind} is of files in a folder, and {out} is none")
+    if name_end not in tables.FORMATS:
+        raise ValueError(f"no format '{name_end}': there are {', '.join(tables.FORMATS)}")
     pairs = [(path, out / f"{path.stem}{name_end}" if is_folder else out) for path in recordings]
     if len({to for _, to in pairs}) < len(pairs):
         raise ValueError(f"{out}: a folder takes several recordings, of different names")
@@ -283,24 +285,18 @@ def export(
         done = _at_once(pairs, backend, known, begin_s, end_s, force=force)
     for (path, to), written in zip(pairs, done, strict=True):
         if isinstance(written, str):
-            _errors.print(written, soft_wrap=True, highlight=False)
             continue
         TERMINAL.print(f"{to}: {written.scans} scans")
         if written.cut_off:
             text = f"{path} was cut off: its last second may be missing"
             _errors.print(text, soft_wrap=True, highlight=False)
-    if failed := sum(isinstance(written, str) for written in done):
-        raise RecordingError(
-            f"{failed} of {len(pairs)} recordings were not exported, the others were"
-        )
-
-
-def _one_of_many(path: Path, *told: Any, force: bool) -> Part | str:
-    """`tables.export`; or why it failed, because the other recordings are still wanted."""
-    try:
-        return tables.export(path, *told, force=force)
-    except (OhmskinError, ValueError) as exc:
-        return str(exc)
+    if failed := [written for written in done if isinstance(written, str)]:
+        *texts, last = dict.fromkeys(failed)
+        if texts or len(failed) < len(done):
+            for text in (*texts, last):
+                _errors.print(" ".join(text.split()), soft_wrap=True, highlight=False)
+            last = f"not exported: {len(failed)} of {len(done)} recordings"
+        raise RecordingError(last)
 
 
 def _at_once(
@@ -317,7 +313,8 @@ def _at_once(
                 # That of the lab, which dask's own configuration names; else one of this machine.
                 stack.enter_context(Client(dashboard_address=None))
             stack.enter_context(joblib.parallel_config(backend))
-            jobs = (joblib.delayed(_one_of_many)(*pair, *told, force=force) for pair in pairs)
+            job = joblib.delayed(tables.export_or_why_not)
+            jobs = (job(*pair, *told, force=force) for pair in pairs)
             done = joblib.Parallel(n_jobs=-1, return_as="generator")(jobs)
             bar = stack.enter_context(_bar())
             return list(bar.track(done, total=len(pairs), description="recordings"))

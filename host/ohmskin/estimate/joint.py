@@ -313,8 +313,8 @@ class JointEstimator(Estimator):
             self._hidden_ohm = wires.hidden_path_ohm
         level = in_series(cell_ohm, self._hidden_ohm)
         level_std = std
-        if wires.told_share:
-            level_std, _ = stds((1.0 - wires.told_share) ** 0.5 * fit.by_means)
+        if told_share := belief.told.told_share:  # of the means, this share is in curves of presses
+            level_std, _ = stds((1.0 - told_share) ** 0.5 * fit.by_means)
         level_std = level_std * (level * cell_ohm) ** 2  # cell and level have the same error in ohm
         return Solution(
             cell_siemens=(1.0 / cell_ohm).reshape(self._shape),

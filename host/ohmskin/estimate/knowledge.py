@@ -41,9 +41,9 @@ MIN_CELL_SIEMENS: Final = 1e-9
 # some 30 ohm to 30 kOhm.
 REF_LOG_STD: Final = 0.01
 # Deviation that all segments share, of a skin that has not been bent since its wires were told:
-# temperature, wear. And the odds that it has not. Chosen: behind wires of some hundred ohms, forces
-# are 15 % better where it has not been, 15 % worse where wires resist 5 to 10 % less, and as good
-# where they resist 30 % more or less.
+# temperature, wear. And the odds, to 1, that it has not. Chosen: behind wires of some hundred ohms,
+# forces are 15 % better where it has not been, 15 % worse where wires resist 5 to 10 % less, and as
+# good where they resist 30 % more or less.
 STILL_STD: Final = 0.02
 STILL_ODDS: Final = 0.3
 # Wires of less count as so much [ohm]. Chosen: its log is finite, and no reading shows it.
@@ -112,27 +112,41 @@ class WireOhm(NamedTuple):
             better = better._replace(lead=found.lead, lead_std_ohm=found.lead_std_ohm)
         return better.for_curves_of(self)
 
-    def told_share(self, top_ohm: float, bottom_ohm: float) -> float:
-        """How much of what wires differ from these was so when they were told, if they are now so.
+    @property
+    def _variances(self) -> tuple[float, float, float]:
+        """Variances of a top and a bottom segment together [ohm^2]: told, still and bent.
 
-        Wires differ because they were told wrongly, by the deviations of the layers, or because the
-        skin has been stretched since: by `STILL_STD`, or, if it has been bent, by `LAYER_STD`. By
-        their sizes, a small change was more likely told wrongly, and a large one is stretch.
-
-        It is one share for layers and lead: frames show whole paths better than which part of a
-        path is long. A skin is stretched as a whole, and presses that take too much for the lead
-        take too little for both layers: so either adds up over the layers. What has no deviation
-        counts as told rightly, as no press measured it.
+        told: of what they were told wrongly by. A skin is stretched as a whole, and presses that
+        take too much for the lead take too little for both layers: so deviations add up over the
+        layers. still, bent: of what they differ by now, if the skin has not been bent since, and if
+        it has.
         """
-        if self.both is None:
-            return 0.0
-        top, bottom = (max(ohm, LEAST_WIRE_OHM) for ohm in self.both)
-        told_ohm = top * (self.top_log_std or 0.0) + bottom * (self.bottom_log_std or 0.0)
-        still, bent = (told_ohm**2 + (std * (top + bottom)) ** 2 for std in (STILL_STD, LAYER_STD))
-        change_ohm = top_ohm - top + bottom_ohm - bottom
+        pairs = zip(self[:2], self[3:5], strict=True)
+        parts = [(max(ohm or 0.0, LEAST_WIRE_OHM), std or 0.0) for ohm, std in pairs]
+        told, path_ohm = sum(ohm * std for ohm, std in parts) ** 2, sum(ohm for ohm, _ in parts)
+        return told, told + (STILL_STD * path_ohm) ** 2, told + (LAYER_STD * path_ohm) ** 2
+
+    @property
+    def told_share(self) -> float:
+        """How much of what wires may differ from these by was so when they were told.
+
+        It is one share for layers and lead, because frames show whole paths better than which part
+        of a path is long. It is 0 if no layer has a deviation: no press measured them.
+        """
+        told, still, bent = self._variances
+        return told * (1 + STILL_ODDS) / (STILL_ODDS * still + bent)
+
+    def told_share_of(self, change_ohm: float) -> float:
+        """The same, if both layers together have changed by so much [ohm].
+
+        A small change of their sum was more likely told wrongly, and a large one is stretch: each
+        of `still` and `bent` is as likely as a normal of its variance says. Between both, the share
+        falls quickly.
+        """
+        told, still, bent = self._variances
         odds = STILL_ODDS * math.sqrt(bent / still)
         odds *= math.exp(0.5 * change_ohm**2 * (1 / bent - 1 / still))
-        return told_ohm**2 * (odds / still + 1 / bent) / (odds + 1)
+        return told * (odds / still + 1 / bent) / (odds + 1)
 
     def of_curves(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
         """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
@@ -142,18 +156,21 @@ class WireOhm(NamedTuple):
         stretch, but frames take for lead some of what layers have changed by, or single segments
         differ by. Against that, a measured lead was told wrongly by its own deviation.
         """
-        left, layers, change_ohm = 1.0 - self.told_share(*now[:2]), [], 0.0
+        pairs = []
         for told, curve, ohm in zip(self[:2], self[6:8], now, strict=False):
             told_ohm = max(UNKNOWN_WIRE_OHM if told is None else told, LEAST_WIRE_OHM)
             curve_ohm = told_ohm if curve is None else max(curve, LEAST_WIRE_OHM)
-            layers.append(curve_ohm * (max(ohm, LEAST_WIRE_OHM) / told_ohm) ** left)
-            change_ohm += ohm - told_ohm
+            pairs.append((told_ohm, curve_ohm, max(ohm, LEAST_WIRE_OHM)))
+        change_ohm = sum(ohm - told_ohm for told_ohm, _, ohm in pairs)
+        left = 1.0 - self.told_share_of(change_ohm)
+        top, bottom = (curve * (ohm / told_ohm) ** left for told_ohm, curve, ohm in pairs)
         told_ohm, _ = self.lead_or_usual(0.0)
         curve_ohm = told_ohm if self.curve_lead is None else self.curve_lead
+        left = 1.0 - self.told_share
         if self.both and self.lead_std_ohm:
             of_layers = change_ohm**2 + (SEGMENT_STD * sum(self.both)) ** 2
             left *= of_layers / (of_layers + self.lead_std_ohm**2)
-        return layers[0], layers[1], max(curve_ohm + left * (now[2] - told_ohm), 0.0)
+        return top, bottom, max(curve_ohm + left * (now[2] - told_ohm), 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
         """These wires, which were learned later, for curves of presses that were told `before`."""

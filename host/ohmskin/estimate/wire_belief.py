@@ -124,14 +124,12 @@ class SkinWires:
     path_ohm: wires and leads between each cell and the sensed ends of its lines, (RC,) [ohm].
     hidden_path_ohm: what of it curves of presses take for a part of the cell, (RC,) [ohm]: what
         single wires differ from their means by, and what the means were told wrongly by.
-    told_share: of what the means have changed by, the share that is in these curves.
     """
 
     segment_ohm: Float
     segment_std_ohm: Float
     path_ohm: Float
     hidden_path_ohm: Float
-    told_share: float
 
 
 @dataclass(eq=False)
@@ -508,8 +506,7 @@ class WireBelief(ABC):
         top_ohm, bottom_ohm = np.exp(means[:2]).tolist()
         curve_ohm = self.told.of_curves((top_ohm, bottom_ohm, float(means[2])))
         hidden_ohm = path_ohm - curve_ohm @ self._wires_of_paths
-        share = self.told.told_share(top_ohm, bottom_ohm)
-        return SkinWires(segments, segments * self.segment_std(), path_ohm, hidden_ohm, share)
+        return SkinWires(segments, segments * self.segment_std(), path_ohm, hidden_ohm)
 
     def _path_ohm(self, segments: Float, leads: Float) -> Float:
         """Wires and leads up to each cell, (RC,), by segments (2, R, C) and leads (R+C,) [ohm]."""

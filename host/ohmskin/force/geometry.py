@@ -39,7 +39,7 @@ KINDS: Final = {
 # No cell is farther from the origin of its frame [m], and no pitch or radius is larger. Chosen:
 # robots are smaller.
 _FARTHEST_M: Final = 100.0
-# No cylinder is thinner, and no cells are nearer [m]. Chosen: no textile bends round less.
+# No cylinder is thinner, and no pitch is less [m]. Chosen: no textile bends round less.
 _LEAST_M: Final = 1e-4
 # A frame's name has at most so many characters. Chosen: names of links in URDF files are shorter.
 _LONGEST_NAME: Final = 100
@@ -90,8 +90,11 @@ class Geometry:
         if self.kind == "table":
             return self.told["position_m"], self.told["normal"]
         across_m, along_m = self.told["pitch_m"]
-        if not np.abs(self.told["pitch_m"]).min() >= _LEAST_M:
-            raise ValueError(f"pitch_m holds a number that is not {_LEAST_M:g} or more")
+        for pitch_m, cells in ((across_m, self.columns), (along_m, self.rows)):
+            if cells > 1 and not abs(pitch_m) >= _LEAST_M:
+                raise ValueError(
+                    f"pitch_m holds {pitch_m:g}: {_LEAST_M:g} is the least, or minus that"
+                )
         x, y = np.meshgrid(across_m * np.arange(self.columns), along_m * np.arange(self.rows))
         zero = np.zeros_like(x)
         if self.kind == "flat":

@@ -123,6 +123,14 @@ def export(
     return part
 
 
+def export_or_why_not(path: Path, *told: Any, force: bool) -> Part | str:
+    """`export`, or why it failed in words: of many recordings, the others are still wanted."""
+    try:
+        return export(path, *told, force=force)
+    except (OhmskinError, ValueError, OSError) as exc:
+        return str(exc)
+
+
 def read_forces(
     part: Part, calibration: Calibration, *, force: bool = False
 ) -> Iterator[ForceScan]:

@@ -27,6 +27,9 @@ from ohmskin.force.geometry import required
 Float = NDArray[np.float64]
 __all__ = ["Pad"]
 
+# A force is spread by at least so much [m]. Chosen: no skin has its taxels nearer.
+LEAST_SPREAD_M = 1e-4
+
 
 class Pad:
     """The skin of a calibration at a site of a model, on all geoms of the site's body.
@@ -50,8 +53,6 @@ class Pad:
         self._site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
         if self._site < 0:
             raise ValueError(f"the model has no site '{site}'")
-        if spread_m is not None and not spread_m > 0:
-            raise ValueError(f"spread_m is {spread_m:g}, it must be above 0")
         geometry = required(calibration.geometry)
         self._model = model
         self._geoms = np.flatnonzero(model.geom_bodyid == model.site_bodyid[self._site])
@@ -61,6 +62,10 @@ class Pad:
         taxels = self._position_m.reshape(-1, 3)
         apart_m = np.linalg.norm(taxels[1:] - taxels[0], axis=1).min(initial=np.inf)
         self.spread_m = float(apart_m) if spread_m is None else spread_m
+        if not self.spread_m >= LEAST_SPREAD_M:
+            raise ValueError(
+                f"spread_m is {self.spread_m:g}, it must be {LEAST_SPREAD_M:g} or more"
+            )
         self.skin = ohmskin.SimulatedSkin(calibration, seed=seed)
 
     def force_n(self, data: mujoco.MjData) -> Float:
