@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`touch`, the networks behind it, and what the wires learn: against whole-circuit solutions."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -333,6 +333,28 @@ def test_a_lesson_that_says_nothing_asks_for_no_other_fit() -> None:
     ports = PortReadings(np.zeros((4, 4)), np.zeros((4, 4)), np.ones((4, 4)))
     belief.expect_usual(False)
     assert not belief.after_fit(SilentFit(), ports)
+
+
+@dataclass
+class TellingFit:
+    """A fit of a new touch, whose lesson is that the top layer resists much more than usual."""
+
+    lesson: Lesson
+    log_cells: Float = field(default_factory=lambda: np.zeros(16))
+
+
+def test_a_frame_of_fingertips_is_not_fitted_again() -> None:
+    """On 16x16, the second fit made the slowest frames, and gained nothing."""
+    again = []
+    for tip_log in (None, np.eye(4).ravel()):
+        belief = LearnedWires((4, 4), WireOhm())
+        slopes = np.zeros((4, belief.means.size))
+        slopes[:2, 0] = 10.0
+        lesson = Lesson(belief.per_mean_std(slopes), np.array([10.0, 10.0, 0.0, 0.0]), np.eye(4))
+        ports = PortReadings(np.zeros((4, 4)), np.zeros((4, 4)), np.ones((4, 4)))
+        again.append(belief.after_fit(TellingFit(lesson), ports, tip_log))
+        assert belief.learned().top > 300.0
+    assert again == [True, False]
 
 
 def test_limits_of_untold_wires_count_as_more_deviations_until_frames_teach_them() -> None:
