@@ -74,7 +74,7 @@ def test_it_is_kept(tmp_path: Path) -> None:
         ({**FLAT, "pitch_m": [0.01]}, "pitch_m has not the shape"),
         ({**FLAT, "pitch_m": [0.01, "x"]}, "pitch_m holds str"),
         ({**FLAT, "pitch_m": [0.01, 1e9]}, "beyond 100"),
-        ({**FLAT, "pitch_m": [0.01, 0]}, "pitch_m holds 0: 0.0001 is the least"),
+        ({**FLAT, "pitch_m": [0.01, 0]}, "pitch_m holds 0: cells are 0.0001 or more apart"),
         ({**FLAT, "frame_id": "a\x1b[2J"}, "frame_id must be a name"),
         ({**CYLINDER, "radius_m": 0}, "radius_m is 0, it must be 0.0001 or more"),
         ({**CYLINDER, "radius_m": 5e-324}, "it must be 0.0001 or more"),

@@ -292,6 +292,7 @@ def export(
             _errors.print(text, soft_wrap=True, highlight=False)
     if failed := [written for written in done if isinstance(written, str)]:
         *texts, last = dict.fromkeys(failed)
+        # One reason that all have in common is the error itself.
         if texts or len(failed) < len(done):
             for text in (*texts, last):
                 _errors.print(" ".join(text.split()), soft_wrap=True, highlight=False)

@@ -166,11 +166,11 @@ class WireOhm(NamedTuple):
         top, bottom = (curve * (ohm / told_ohm) ** left for told_ohm, curve, ohm in pairs)
         told_ohm, _ = self.lead_or_usual(0.0)
         curve_ohm = told_ohm if self.curve_lead is None else self.curve_lead
-        left = 1.0 - self.told_share
+        lead_left = 1.0 - self.told_share
         if self.both and self.lead_std_ohm:
             of_layers = change_ohm**2 + (SEGMENT_STD * sum(self.both)) ** 2
-            left *= of_layers / (of_layers + self.lead_std_ohm**2)
-        return top, bottom, max(curve_ohm + left * (now[2] - told_ohm), 0.0)
+            lead_left *= of_layers / (of_layers + self.lead_std_ohm**2)
+        return top, bottom, max(curve_ohm + lead_left * (now[2] - told_ohm), 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
         """These wires, which were learned later, for curves of presses that were told `before`."""

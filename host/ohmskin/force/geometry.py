@@ -92,9 +92,7 @@ class Geometry:
         across_m, along_m = self.told["pitch_m"]
         for pitch_m, cells in ((across_m, self.columns), (along_m, self.rows)):
             if cells > 1 and not abs(pitch_m) >= _LEAST_M:
-                raise ValueError(
-                    f"pitch_m holds {pitch_m:g}: {_LEAST_M:g} is the least, or minus that"
-                )
+                raise ValueError(f"pitch_m holds {pitch_m:g}: cells are {_LEAST_M:g} or more apart")
         x, y = np.meshgrid(across_m * np.arange(self.columns), along_m * np.arange(self.rows))
         zero = np.zeros_like(x)
         if self.kind == "flat":
