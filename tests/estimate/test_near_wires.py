@@ -163,19 +163,28 @@ def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one(segments: int)
         both = [learned(by_mean, noise, residual, faded) for faded in (wary, changed)]
         likelihoods, moves, covariances = (np.array(each) for each in zip(*both, strict=True))
         of_both = np.array([1, CHANGED_ODDS]) / (1 + CHANGED_ODDS) * likelihoods
-        wary_mean, wary = mixture(of_both, wary_mean + moves, covariances)
+        both_means = wary_mean + moves
+        wary_mean, wary = mixture(of_both, both_means, covariances)
 
         scores = MEMORY * scores + np.log([of_steady, of_both.sum()])
         weights = np.array([1, WARY_ODDS]) * np.exp(scores)
         mean, covariance = mixture(
             weights, np.array([steady_mean, wary_mean]), np.array([steady, wary])
         )
-    wary_std = np.hypot(np.sqrt(np.diag(wary)), wary_mean - mean)[:2]
+    # The means of a layer that the mixture exceeds with 1 %: there its distribution has 0.99.
+    shares = np.array([weights[0], *weights[1] * of_both / of_both.sum()]) / weights.sum()
+    of_parts = np.array([steady, *covariances])
+    logs, limit_stds = np.linspace(-3.0, 3.0, 60001), []
+    for layer in range(2):
+        centres = np.array([steady_mean[layer], *both_means[:, layer]]) - mean[layer]
+        below = scipy.stats.norm.cdf(logs[:, None], centres, of_parts[:, layer, layer] ** 0.5)
+        limit = np.interp(0.99, below @ shares, logs)
+        limit_stds.append(limit / scipy.stats.norm.ppf(0.99))
     layer_std = np.sqrt(np.diag(covariance))[:2]
-    reach = [*np.expm1(2 * np.maximum(wary_std, layer_std)), 2 * covariance[2, 2] ** 0.5]
+    reach = [*np.expm1(2 * np.maximum(limit_stds, layer_std)), 2 * covariance[2, 2] ** 0.5]
     for usual in (True, False):
         belief.expect_usual(usual)
-        np.testing.assert_allclose(belief.upper_limits().reach, reach)
+        np.testing.assert_allclose(belief.upper_limits().reach, reach, rtol=1e-6)
     np.testing.assert_allclose(belief.means_std(), np.sqrt(covariance.diagonal()))
     np.testing.assert_allclose(belief.expected_wires, wires_of(mean), rtol=1e-9)
     # How wires follow the means: by differences.

@@ -47,14 +47,22 @@ any lesson. A filter adds up its scores, and at each lesson the sum keeps the sh
 it was.
 
 Most lessons say too little to show a change. A fit takes what is believed, which has the least
-error on a skin that lies still. But the upper deviations of its answer are as wide as those of the
-wary filter: if wires have just grown longer, cells conduct more than they seem to.
+error on a skin that lies still. But if wires have just grown longer, cells conduct more than they
+seem to. The deviation of a mixture hardly shows a part that is unlikely and far away. So the upper
+limit of a layer is that of the mixture itself: the log that it exceeds with a probability of 1 %,
+
+    sum_i p_i Phi((m_i - limit) / s_i) = 0.01 ,
+
+where each part i (steady; wary, stayed; wary, changed) has the probability p_i and a normal.
 """
 
 import math
+from collections.abc import Sequence
+from statistics import NormalDist
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.small import cholesky, solve_lower
@@ -74,6 +82,9 @@ from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, Fit, Lesson, WireBelief
 # A fingertip is the same as that of the last lesson if both are more alike. Chosen: on 16x16, it
 # has to move by about its width.
 SAME_TIP: Final = 0.6
+# The probability that a layer is longer than its upper limit. Chosen: less than at 2 deviations of
+# a normal, because wires that change at once are rare, and errors are large then.
+LONGER_CHANCE: Final = 0.01
 
 
 class _Filter(NamedTuple):
@@ -103,15 +114,34 @@ def _stepped(before: _Filter, covariance: Float, slopes: Float, residual: Float)
     return _Filter(means, covariance, MEMORY * before.score + score)
 
 
-def _mixture(one: _Filter, other: _Filter, odds: float) -> _Filter:
-    """Mean and covariance of both. odds: of the other to the one, before their scores."""
+def _mixture(one: _Filter, other: _Filter, odds: float) -> tuple[_Filter, float]:
+    """Mean and covariance of both, and the share of the other.
+
+    odds: of the other to the one, before their scores.
+    """
     log_odds = math.log(odds) + other.score - one.score
     share = 1.0 / (1.0 + math.exp(min(-log_odds, 500.0)))
     apart = other.means - one.means
     covariance = (1 - share) * one.covariance + share * other.covariance
     covariance += share * (1 - share) * np.outer(apart, apart)
     score = one.score + np.logaddexp(0.0, log_odds) - math.log1p(odds)
-    return _Filter(one.means + share * apart, covariance, float(score))
+    return _Filter(one.means + share * apart, covariance, float(score)), share
+
+
+def _exceeded(parts: Sequence[tuple[float, float, float]], chance: float) -> float:
+    """What a mixture of normals exceeds with this probability.
+
+    parts: of each, its share, mean and standard deviation.
+    """
+    stds = NormalDist().inv_cdf(1.0 - chance)
+    alone = [mean + stds * std for _, mean, std in parts]
+
+    def too_likely(limit: float) -> float:
+        tails = (share * math.erfc((limit - mean) / std / 2**0.5) for share, mean, std in parts)
+        return 0.5 * sum(tails) - chance
+
+    # Where all parts agree, rounding must not hide that the limit is between them.
+    return float(brentq(too_likely, min(alone) - 1e-3, max(alone) + 1e-3, xtol=1e-9))
 
 
 class LearnedWires(WireBelief):
@@ -125,6 +155,8 @@ class LearnedWires(WireBelief):
         self._tip_log = np.zeros(self.leads_of_ports.shape[0])
         known = _Filter(self._known.means, self._known.covariance)
         self._filters = self._before_lesson = [known] * 2
+        # Of what the last lesson has left: the share of each part, and its filter.
+        self._parts = [(1.0, known)]
 
     def learn_segments(self) -> None:
         """As of any belief. Each filter learns them."""
@@ -196,9 +228,11 @@ class LearnedWires(WireBelief):
         steady, wary = map(self._dried, self._before_lesson)
         steady = stepped(steady, self._faded(steady))
         stayed, changed = stepped(wary, wary.covariance), stepped(wary, self._changed(wary))
-        wary = _mixture(stayed, changed, CHANGED_ODDS)
+        wary, share = _mixture(stayed, changed, CHANGED_ODDS)
         self._filters = [steady, wary]
-        believed = _mixture(steady, wary, WARY_ODDS)
+        believed, of_wary = _mixture(steady, wary, WARY_ODDS)
+        shares = 1.0 - of_wary, of_wary * (1.0 - share), of_wary * share
+        self._parts = list(zip(shares, (steady, stayed, changed), strict=True))
         self._believe(believed.means, believed.covariance)
 
     def _faded(self, before: _Filter) -> Float:
@@ -234,6 +268,12 @@ class LearnedWires(WireBelief):
         covariance[leaks, leaks] = np.diag(np.maximum(first, now)[leaks])
         return before._replace(covariance=covariance)
 
-    def _wary_layer_stds(self) -> Float:
-        wary = self._filters[1]
-        return np.hypot(np.sqrt(wary.covariance.diagonal()), wary.means - self._known.means)[:2]
+    def _layer_limit_stds(self) -> Float:
+        limits = []
+        for layer in range(2):
+            of_layer = [
+                (share, part.means[layer], math.sqrt(part.covariance[layer, layer]))
+                for share, part in self._parts
+            ]
+            limits.append(_exceeded(of_layer, LONGER_CHANCE) - self._known.means[layer])
+        return np.array(limits) / NormalDist().inv_cdf(1.0 - LONGER_CHANCE)

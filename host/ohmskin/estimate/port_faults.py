@@ -158,6 +158,7 @@ class LinePairs:
         """least_std [S]: of a current that is only rounded; none is believed to be known better."""
         self._axis, self._least_std = axis, least_std
         self._lines, self._ports = (rest.current if axis == 0 else rest.current.T).shape
+        self._pairs = np.triu(np.ones((self._lines, self._lines), dtype=bool), 1)  # each once
         self._rest_std = self._largest_std(rest)
         self._rest_apart = self._apart(rest)
         self.reset()
@@ -204,7 +205,7 @@ class LinePairs:
         shows_apart = apart > 2 * SAME_STDS
         self._alike_frames = np.where(shows_apart, 0, self._alike_frames + 1)
         self._never_apart &= ~shows_apart
-        alike = np.triu(apart < SAME_STDS, 1)
+        alike = (apart < SAME_STDS) & self._pairs
         # Lines that hardly differed at rest are alike without any fault. So a pair counts only if
         # it differed at rest by clearly more than this frame's noise.
         noisier = max(self._largest_std(now) / self._rest_std, 1.0)
@@ -222,17 +223,17 @@ class LinePairs:
     def _first(self, is_alike: Bool, high: Bool) -> str:
         if not is_alike.any():
             return ""
-        pairs = np.argwhere(np.triu(is_alike & high & high[:, None], 1))
+        pairs = np.argwhere(is_alike & high & high[:, None] & self._pairs)
         return f"{_LINES[self._axis]}s {pairs[0][0]} and {pairs[0][1]}" if len(pairs) else ""
 
     def _apart(self, ports: PortCurrents) -> Float:
         """Largest difference between two lines' currents, in deviations (lines, lines)."""
         current, std = ports.current, np.maximum(ports.std, self._least_std)
-        if self._axis == 1:
+        if self._axis == 0:
             current, std = current.T, std.T
-        difference = np.abs(current[:, None, :] - current)
-        difference /= np.maximum(std[:, None, :], std)
-        return np.asarray(difference.max(axis=2))
+        difference = np.abs(current[:, :, None] - current[:, None])  # (ports, lines, lines)
+        difference /= np.maximum(std[:, :, None], std[:, None])
+        return np.asarray(difference.max(axis=0))
 
     def _largest_std(self, ports: PortCurrents) -> float:
         return max(float(ports.std.max()), self._least_std)

@@ -295,7 +295,7 @@ def siemens_std(
     most = (MOST_LOST_SHARE + REACH_STDS * own_std)[:, None] / np.maximum(by_means, 1e-12)
     bounds = most.argmin(axis=0)
     reach = np.minimum(upper.reach, most[bounds, range(3)])
-    together = (by_means[:, None] * most[bounds]).max(axis=2).min(axis=1)
+    together = (most[bounds][..., None] * by_means.T).max(axis=1).min(axis=0)
     limits = np.array([reach, upper.reach, upper.stds])
     taken, highest, stated = np.sqrt(limits**2 @ square.T)
     share = np.minimum(taken, together)

@@ -434,15 +434,15 @@ class WireBelief(ABC):
         if self._known.limits is None:
             known = self._known.means_std[:3]
             reach, count = REACH_STDS * known, np.full(3, REACH_STDS)
-            reach[:2] = np.expm1(REACH_STDS * np.maximum(self._wary_layer_stds(), known[:2]))
+            reach[:2] = np.expm1(REACH_STDS * np.maximum(self._layer_limit_stds(), known[:2]))
             if self.untold:
                 taught = REACH_STDS * known[:2] / LAYER_STD
                 count[:2] = np.clip(taught, REACH_STDS, UNTOLD_REACH_STDS)
             self._known.limits = UpperLimits(reach, reach / count)
         return self._known.limits
 
-    def _wary_layer_stds(self) -> Float:
-        """Deviations of both layers (2,), for wires that may have changed since the last frame."""
+    def _layer_limit_stds(self) -> Float:
+        """How far above their means upper limits of both layers (2,) are, counted as deviations."""
         return self._known.means_std[:2]
 
     @property

@@ -58,7 +58,7 @@ def test_a_weight_lies_on_the_skin(skin_json: str) -> None:
     model, data = resting(0.3, x=0.012, y=-0.007)
     pad = Pad(model, "skin", ohmskin.load_calibration(skin_json))
     assert pad.spread_m == pytest.approx(0.01)
-    with pytest.raises(ValueError, match="spread_m is 0, it must be 0.0001 or more"):
+    with pytest.raises(ValueError, match=r"spread_m is 0, it must be 0\.0001 or more"):
         Pad(model, "skin", ohmskin.load_calibration(skin_json), spread_m=0.0)
     true_n = pad.force_n(data)
     assert true_n.sum() == pytest.approx(0.3 * 9.81, rel=1e-3)
