@@ -75,7 +75,7 @@ def test_voltages_over_cells_of_a_touched_skin_are_a_laplacians(far: tuple[bool,
     laplacian = skin_network(skin)
     top, bottom = np.arange(sum(shape), laplacian.nodes).reshape(2, *shape)
     some = np.array([0, 3, 7, 19])
-    slopes, forced = network.own_slope(some)
+    slopes, forced = network.own_slope()
     currents = network.cell_current(some)
     for port, (i, j) in enumerate(np.ndindex(shape)):
         far_row, far_column = (top[i, -1] if far[0] else i), (bottom[-1, j] if far[1] else 4 + j)
@@ -84,11 +84,11 @@ def test_voltages_over_cells_of_a_touched_skin_are_a_laplacians(far: tuple[bool,
         assert network.port_ohm[port] == pytest.approx(driven[far_row] - driven[far_column])
         np.testing.assert_allclose(network.volt[:, port], over_cells[0][cells], rtol=1e-6)
         np.testing.assert_allclose(network.sense_volt[:, port], over_cells[1][cells], rtol=1e-6)
+        assert slopes[port] == pytest.approx(over_cells[0][port] * over_cells[1][port])
+        alone = per_ampere(laplacian, top[i, j], bottom[i, j])
+        assert forced[port] == pytest.approx(alone[top[i, j]] - alone[bottom[i, j]])
         if port in some:
             number = some.tolist().index(port)
-            assert slopes[number] == pytest.approx(over_cells[0][port] * over_cells[1][port])
-            alone = per_ampere(laplacian, top[i, j], bottom[i, j])
-            assert forced[number] == pytest.approx(alone[top[i, j]] - alone[bottom[i, j]])
             for current, volt in zip(currents, over_cells, strict=True):
                 np.testing.assert_allclose(current[number], volt * touched.ravel(), rtol=1e-5)
     # `PortCircuit` has its slopes by wires from finite differences of a Laplacian (test_far_ends).

@@ -9,7 +9,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,8 +101,7 @@ class Estimate:
             return 1.0 / self.cell_siemens
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(NamedTuple):
     """What a method finds in one frame. `Estimator.estimate` makes an `Estimate` of it.
 
     cell_siemens: conductance of each cell (R, C) [S].
@@ -278,12 +277,11 @@ class Estimator(ABC):
             rest_siemens = self._rest.cell_siemens
             std = np.hypot(std, self._rest.cell_siemens_std)
         known_std = np.where(np.isnan(std), 0.0, std)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ohm = 1.0 / siemens
-            # Stated deviations reach to this limit.
-            lower_ohm = 1.0 / np.maximum(siemens - REACH_STDS * known_std, 0.0)
-            lowest = 1.0 / (ohm + TOUCH_STDS / REACH_STDS * (lower_ohm - ohm))
-        return np.asarray((siemens - rest_siemens > TOUCH_SIEMENS) & (lowest > rest_siemens))
+        # Stated deviations reach to this limit. The rule's resistance goes `over` times as far.
+        lower, over = np.maximum(siemens - REACH_STDS * known_std, 0.0), TOUCH_STDS / REACH_STDS
+        # 1 / (1 / g + over (1 / lower - 1 / g)) > g_rest, times g, lower and its denominator.
+        is_above = siemens * lower > rest_siemens * (over * siemens + (1.0 - over) * lower)
+        return np.asarray((siemens - rest_siemens > TOUCH_SIEMENS) & is_above)
 
     def _chi2(self, ports: PortReadings, current_siemens: Float) -> float:
         """`Estimate.chi2` of a model that gives these currents of ports (R, C) [S]."""
@@ -293,6 +291,7 @@ class Estimator(ABC):
             return float(off.ravel() @ off.ravel()) / off.size
         references = knowledge.ref_top_ohm, knowledge.ref_bottom_ohm
         model = ratio_from_current(current_siemens, *references)
-        residual = (ports.ratio - model) / knowledge.ratio_std
-        residual = residual[~np.isnan(residual)]  # of what was read
+        residual = ((ports.ratio - model) / knowledge.ratio_std).ravel()
+        if np.isnan(residual @ residual):
+            residual = residual[~np.isnan(residual)]  # of what was read
         return float(residual @ residual) / residual.size

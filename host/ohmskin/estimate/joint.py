@@ -18,7 +18,6 @@ few touches. Where they do not explain the frame, or lie as under a fingertip, i
 `joint`. Without rest readings no cell is known to be untouched, so every frame is for `joint`.
 """
 
-from dataclasses import replace
 from typing import ClassVar, Final
 
 import numpy as np
@@ -37,6 +36,7 @@ from ohmskin.estimate.port_readings import PortReadings
 from ohmskin.estimate.prior import (
     CLEAR_LOG,
     HIGHEST_TOUCH_SIEMENS,
+    LEAST_TIP,
     MAX_CHI2,
     CellPrior,
     rest_level,
@@ -80,6 +80,7 @@ class JointEstimator(Estimator):
         believe = MeasuredWires if any(far) else LearnedWires
         wires, bent = knowledge.nominal_wire_ohm, knowledge.may_be_bent
         self._belief: WireBelief = believe(self._shape, wires, far, may_be_bent=bent)
+        self._told_share = wires.told_share
         rest = knowledge.rest_ratio
         rest_ports = None if rest is None else self._reader.read(rest)
         self._at_rest = CellsAtRest(rest_ports, self._belief, knowledge.ref_ohm)
@@ -180,12 +181,12 @@ class JointEstimator(Estimator):
         self._whole_message = self._belief.fault
         # The cells are by what was believed before; the wires have learned from this frame.
         wires = self._belief.believed_wires()
-        return replace(
-            solution,
+        taught = solution._replace(
             message=self._whole_message,
             wire_ohm=wires.segment_ohm,
             wire_ohm_std=wires.segment_std_ohm,
-        ), again
+        )
+        return taught, again
 
     def _of_all(
         self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None, *, again: bool
@@ -313,7 +314,7 @@ class JointEstimator(Estimator):
             self._hidden_ohm = wires.hidden_path_ohm
         level = in_series(cell_ohm, self._hidden_ohm)
         level_std = std
-        if told_share := belief.told.told_share:  # of the means, this share is in curves of presses
+        if told_share := self._told_share:  # of the means, this share is in curves of presses
             level_std, _ = stds((1.0 - told_share) ** 0.5 * fit.by_means)
         level_std = level_std * (level * cell_ohm) ** 2  # cell and level have the same error in ohm
         return Solution(
@@ -392,7 +393,8 @@ class TouchEstimator(JointEstimator):
         # Where wires are assumed, the fit of all resistances teaches them sooner.
         if self.knowledge.rest_ratio is None or self._belief.is_assumed:
             return None
-        if not self._knows_wires and prior.fingertips(touches.log_cells, self._shape).any():
+        may_be_tip = touches.cells.size >= LEAST_TIP and not self._knows_wires
+        if may_be_tip and prior.fingertips(touches.log_cells, self._shape).any():
             return None
         touched = touches.explain()
         if touched and touched.log_cells_std[touched.cells].max(initial=0.0) <= CLEAR_LOG:

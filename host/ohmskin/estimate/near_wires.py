@@ -150,7 +150,7 @@ class LearnedWires(WireBelief):
     def reset(self) -> None:
         """Back to the nominal wires; single segments in m, too, are nominal ones again."""
         super().reset()
-        self._lesson_noise = np.inf  # mean deviation of the last lesson's currents [S]
+        self._lesson_noise = np.inf  # deviations of the last lesson's currents, in sum [S]
         # How cells rose under the fingertips of the last lesson, or 0, (RC,).
         self._tip_log = np.zeros(self.leads_of_ports.shape[0])
         known = _Filter(self._known.means, self._known.covariance)
@@ -185,7 +185,7 @@ class LearnedWires(WireBelief):
         The calmer frame must not count as one more, since both have the touch's errors. So it takes
         the place of the other. So does a harder frame of a fingertip that has hardly moved.
         """
-        noise, is_news = float(ports.current_std.mean()), self._has_moved(fit.log_cells)
+        noise, is_news = float(ports.current_std.sum()), self._has_moved(fit.log_cells)
         tip = np.zeros_like(fit.log_cells) if tip_log is None else tip_log
         if is_news and likeness(tip, self._tip_log) > SAME_TIP:
             is_news, tells_more = False, bool(tip @ tip > self._tip_log @ self._tip_log)

@@ -158,7 +158,7 @@ class LinePairs:
         """least_std [S]: of a current that is only rounded; none is believed to be known better."""
         self._axis, self._least_std = axis, least_std
         self._lines, self._ports = (rest.current if axis == 0 else rest.current.T).shape
-        self._pairs = np.triu(np.ones((self._lines, self._lines), dtype=bool), 1)  # each once
+        self._each_pair = np.triu(np.ones((self._lines, self._lines), dtype=bool), 1)
         self._rest_std = self._largest_std(rest)
         self._rest_apart = self._apart(rest)
         self.reset()
@@ -193,29 +193,33 @@ class LinePairs:
         is_wanted = most == 0 or most >= ALIKE_FRAMES
         return bool(is_wanted or np.count_nonzero(high) >= 2 or np.count_nonzero(touched) >= 2)
 
-    def compare(self, now: PortCurrents, high: Bool, places: NDArray[np.intp]) -> tuple[str, Bool]:
-        """Compare all pairs of lines in a frame.
-
-        Returns the first pair of lines that is shorted, in words, or empty; and which lines are in
-        doubt (lines,): touched, and alike for so long that they may be shorted.
-        """
+    def compare(self, now: PortCurrents) -> bool:
+        """Compare all pairs of lines in a frame. Returns whether it shows any pair alike."""
         apart = self._apart(now)
         # Two shorted lines may differ by more than the limit in a noisy frame. So only a difference
         # of twice the limit shows them apart.
         shows_apart = apart > 2 * SAME_STDS
         self._alike_frames = np.where(shows_apart, 0, self._alike_frames + 1)
         self._never_apart &= ~shows_apart
-        alike = (apart < SAME_STDS) & self._pairs
+        self._alike = (apart < SAME_STDS) & self._each_pair
+        self._noisier = max(self._largest_std(now) / self._rest_std, 1.0)
+        return bool(self._alike.any())
+
+    def judge(self, high: Bool, places: NDArray[np.intp]) -> tuple[str, Bool]:
+        """What is wrong with the pairs that the last frame compared shows alike.
+
+        Returns the first pair of lines that is shorted, in words, or empty; and which lines are in
+        doubt (lines,): touched, and alike for so long that they may be shorted.
+        """
         # Lines that hardly differed at rest are alike without any fault. So a pair counts only if
         # it differed at rest by clearly more than this frame's noise.
-        noisier = max(self._largest_std(now) / self._rest_std, 1.0)
-        differed = self._rest_apart > 2 * SAME_STDS * noisier
+        differed = self._rest_apart > 2 * SAME_STDS * self._noisier
         least_places = np.minimum(places, places[:, None])
         # If no frame has shown them apart, they may have been shorted between rest and the first
         # frame, and need not be alike for long. But a touch at one place may be a finger on both.
         since = self._never_apart & (least_places != 1)
-        is_shorted = alike & differed & (since | (self._alike_frames >= ALIKE_FRAMES))
-        doubt = alike & (self._never_apart | (self._alike_frames >= DOUBT_FRAMES))
+        is_shorted = self._alike & differed & (since | (self._alike_frames >= ALIKE_FRAMES))
+        doubt = self._alike & (self._never_apart | (self._alike_frames >= DOUBT_FRAMES))
         doubt &= least_places > 0
         in_doubt = np.asarray(doubt.any(axis=0) | doubt.any(axis=1))
         return self._first(is_shorted, high), in_doubt
@@ -223,7 +227,7 @@ class LinePairs:
     def _first(self, is_alike: Bool, high: Bool) -> str:
         if not is_alike.any():
             return ""
-        pairs = np.argwhere(is_alike & high & high[:, None] & self._pairs)
+        pairs = np.argwhere(is_alike & high & high[:, None] & self._each_pair)
         return f"{_LINES[self._axis]}s {pairs[0][0]} and {pairs[0][1]}" if len(pairs) else ""
 
     def _apart(self, ports: PortCurrents) -> Float:
@@ -253,6 +257,7 @@ class SkinFaults:
         self._pairs: list[LinePairs] = []
         if rest is not None:
             self._pairs = [LinePairs(axis, rest, knowledge.current_std) for axis in (0, 1)]
+            self._rest_current = np.maximum(rest.current, MIN_CELL_SIEMENS)
         self.reset()
 
     def reset(self) -> None:
@@ -294,12 +299,13 @@ class SkinFaults:
         fault = self._loss(now, self._rest)
         if fault or not is_whole:
             return fault
-        over_rest = now.current / np.maximum(self._rest.current, MIN_CELL_SIEMENS)
-        is_touched = now.current > TOUCHED_TIMES * self._rest.current + FAULT_STDS * now.std
+        over_rest = now.current / self._rest_current
+        is_touched = now.current > TOUCHED_TIMES * self._rest_current + FAULT_STDS * now.std
         for axis, pairs in enumerate(self._pairs):
             high = np.asarray((over_rest > 1.0 + DRIFT_SHARE).all(axis=1 - axis))
             touched = is_touched if axis == 0 else is_touched.T
-            if pairs.needs_frame(high, np.asarray(touched.any(axis=1))):
+            wanted = pairs.needs_frame(high, np.asarray(touched.any(axis=1)))
+            if wanted and pairs.compare(now):  # sound skins hardly ever show lines alike
                 # Touches raise the currents of untouched lines as well. Under an edge or half a
                 # palm, they tie all lines of the other layer to one node: then an untouched line
                 # draws the same current from each of them, and two lines may be alike by chance.
@@ -310,7 +316,7 @@ class SkinFaults:
                 high &= higher.all(axis=1 - axis)
                 begins = touched[:, 1:] & ~touched[:, :-1]
                 places = touched[:, 0] + np.count_nonzero(begins, axis=1)
-                pair, doubt = pairs.compare(now, high, places)
+                pair, doubt = pairs.judge(high, places)
                 if pair:
                     return f"{pair} read alike as they did not at rest: shorted?"
                 self.doubt |= doubt[:, None] if axis == 0 else doubt
@@ -325,7 +331,10 @@ class SkinFaults:
         """A current that is below that at rest, by more than drift and noise."""
         std = np.hypot(now.std, rest.std)
         loss = (1.0 - DRIFT_SHARE) * rest.current - now.current - FAULT_STDS * std
-        if np.count_nonzero(loss > 0) > 0.5 * loss.size:
+        lost = np.count_nonzero(loss > 0)
+        if not lost:  # as in most frames
+            return ""
+        if lost > 0.5 * loss.size:
             return "the whole skin conducts less than at rest: take the rest readings anew"
         return worst_cell(loss, LOSS_TEXT)
 

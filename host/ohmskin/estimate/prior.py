@@ -282,23 +282,24 @@ def siemens_std(
     """
     siemens = np.exp(log_siemens)
     cell_ohm = 1.0 / siemens
+    whole_ohm = cell_ohm + series_ohm
     # d log I = - r / (r + series) d log r. So at the limits the current is (1 +- off) I, and the
     # whole resistance is (r + series) / (1 +- off). The cell's is this less `series_ohm`.
-    reach_per_std = REACH_STDS * cell_ohm / (cell_ohm + series_ohm)
+    reach_per_std = REACH_STDS * cell_ohm / whole_ohm
     square = by_means * by_means
     log_std = np.sqrt(own_std * own_std + square @ means_std**2)
     off_up, off_down = reach_per_std * own_std, np.minimum(reach_per_std * log_std, 1.0 - 1e-6)
-    own_ohm = (cell_ohm + series_ohm) * off_up / (1.0 + off_up)
-    highest_ohm = (cell_ohm + off_down * series_ohm) / (1.0 - off_down)
-    # How far each cell lets each mean rise alone. Of the three cells that bound the means, each
-    # bounds what all of them take together as well.
-    most = (MOST_LOST_SHARE + REACH_STDS * own_std)[:, None] / np.maximum(by_means, 1e-12)
-    bounds = most.argmin(axis=0)
-    reach = np.minimum(upper.reach, most[bounds, range(3)])
-    together = (most[bounds][..., None] * by_means.T).max(axis=1).min(axis=0)
-    limits = np.array([reach, upper.reach, upper.stds])
-    taken, highest, stated = np.sqrt(limits**2 @ square.T)
-    share = np.minimum(taken, together)
+    own_ohm = whole_ohm * off_up / (1.0 + off_up)
+    lowest_siemens = (1.0 - off_down) / (cell_ohm + off_down * series_ohm)
+    highest, stated = np.sqrt(np.array([upper.reach, upper.stds]) ** 2 @ square.T)
+    # The share of all that a cell can lose that each mean takes, per rise. The cell that loses most
+    # to a mean bounds it; of the three such cells, each bounds what all means take as well.
+    share, lost = highest, by_means / (MOST_LOST_SHARE + REACH_STDS * own_std)[:, None]
+    if (lost.max(axis=0) * upper.reach).max() > 3**-0.5:  # else all three take less than all
+        bounds, most = lost.argmax(axis=0), 1.0 / np.maximum(lost, 1e-12)
+        reach = np.minimum(upper.reach, most[bounds, range(3)])
+        together = (by_means[:, None] * most[bounds]).max(axis=2).min(axis=1)
+        share = np.minimum(np.sqrt(square @ reach**2), together)
     # As how many deviations the limits count.
     count = np.maximum(highest / np.maximum(stated, 1e-30), REACH_STDS)
 
@@ -309,4 +310,4 @@ def siemens_std(
     # A cell may conduct nearly as much as the hardest touch, or more. Then the distance to the
     # limit is too small, or below 0. So no less than the deviation to first order is stated.
     up = np.maximum(siemens * log_std, np.hypot(up_own, up_means))
-    return np.asarray(up), np.asarray((siemens - 1.0 / highest_ohm) / REACH_STDS)
+    return np.asarray(up), np.asarray((siemens - lowest_siemens) / REACH_STDS)

@@ -95,6 +95,7 @@ class RestNetwork(PortCircuit):
     volts: both of them; where all ends are near ends, these are one.
     cell_volt: M, (RC, RC).
     own_slope: -d rho / d g of each cell at its own port, (RC,) [ohm^2].
+    own_volt: M[e, e] of each cell, (RC,) [ohm].
     """
 
     def __init__(self, cell_siemens: Float, *wire_ohm: float, **others: Any) -> None:
@@ -118,6 +119,8 @@ class RestNetwork(PortCircuit):
         self.cell_volt = -in_series / siemens / siemens[:, None]
         self.cell_volt.ravel()[:: siemens.size + 1] += 1.0 / siemens
         self.own_slope = self.port_volt.diagonal() * self.sense_volt.diagonal()
+        self.own_volt = self.cell_volt.diagonal()
+        self._segment_ohm = np.stack([np.broadcast_to(ohm, self.shape) for ohm in self.wire_ohm])
 
     def by_wires_of(self, ports: Cells, cell_current: Float, sense_current: Float) -> Float:
         """d rho / dw of all wires, (m, 2RC) [ohm], from cell currents of ports, (m, RC).
@@ -135,9 +138,7 @@ class RestNetwork(PortCircuit):
             slopes *= sensed
         else:
             slopes *= slopes
-        ohm = np.empty((2, *self.shape))
-        ohm[0], ohm[1] = self.wire_ohm
-        slopes *= ohm
+        slopes *= self._segment_ohm
         return slopes.reshape(len(cell_current), -1)
 
 
@@ -153,24 +154,24 @@ class TouchedNetwork:
         self._system = rest.cell_volt[cells[:, None], cells]
         self._system.ravel()[:: cells.size + 1] += 1.0 / added
         # q by the driven ends, and by the sensed ones if they are others.
-        self._drawn = [solve_positive(self._system, volt[cells]) for volt in rest.volts]
+        at_rest = [volt[cells] for volt in rest.volts]
+        self._drawn = [solve_positive(self._system, volt) for volt in at_rest]
         volts = [drawn / added[:, None] for drawn in self._drawn]
         self.volt, self.sense_volt = volts[0], volts[-1]
-        self.port_ohm = rest.port_ohm - (rest.sense_volt[cells] * self._drawn[0]).sum(axis=0)
+        self.port_ohm = rest.port_ohm - (at_rest[-1] * self._drawn[0]).sum(axis=0)
 
-    def own_slope(self, cells: Cells) -> tuple[Float, Float]:
-        """-d rho / d g of some cells, each at its own port, and their M[e, e], cells touched."""
+    def own_slope(self) -> tuple[Float, Float]:
+        """-d rho / d g of each cell at its own port, and its M[e, e], cells touched, both (RC,)."""
         rest = self._rest
         if not self._cells.size:  # as in most frames: this saves a tenth of their time
-            return rest.own_slope[cells], rest.cell_volt[cells, cells]
-        coupling = rest.cell_volt[self._cells[:, None], cells]
+            return rest.own_slope, rest.own_volt
+        coupling = rest.cell_volt[self._cells]
         by_forced = solve_positive(self._system, coupling)  # q, of currents forced through cells
         volts = [
-            volt[cells, cells] - (coupling * drawn[:, cells]).sum(axis=0)
+            volt.diagonal() - (coupling * drawn).sum(axis=0)
             for volt, drawn in zip(rest.volts, self._drawn, strict=True)
         ]
-        cell_volt = rest.cell_volt[cells, cells] - (coupling * by_forced).sum(axis=0)
-        return volts[0] * volts[-1], cell_volt
+        return volts[0] * volts[-1], rest.own_volt - (coupling * by_forced).sum(axis=0)
 
     def slopes(
         self, ports: Cells, prior: CellPrior, belief: WireBelief, fitted: Cells | None = None
@@ -351,6 +352,13 @@ class FewTouches:
         self._std[self.cells] = self._reading_std[self.cells]
         self._residual = (self._measured - self._current) / self._std
 
+    def _forecast(self, log_siemens: Float, slopes: Float) -> None:
+        """Take these log conductances of the same cells, (k,), and what `slopes` make of them."""
+        change = (log_siemens - self.log_siemens) @ slopes
+        self.log_siemens = log_siemens
+        self._current = self._current + change * self._std
+        self._residual = self._residual - change
+
     def converge(self, cells: Cells, log_siemens: Float) -> None:
         """Step from these cells until no step matters; cells that fall back to rest are taken out.
 
@@ -402,26 +410,24 @@ class FewTouches:
         skin = self._skin
         asks = self._residual > DEMAND_STDS
         asks[self.cells] = False
-        asked = asks.nonzero()[0]
-        if not asked.size:
-            return asked, np.zeros(0)
-        slope, cell_volt = self._touched.own_slope(asked)
+        if not asks.any():
+            return NO_CELLS, np.zeros(0)
+        slope, cell_volt = self._touched.own_slope()
         # A port has at least the resistance of its wires. They may resist less than is believed, so
         # that half of it is taken for the least. Where noise makes a reading show still less, this
         # least counts: the reading then asks for a very hard touch, and not for a touch of negative
         # resistance.
-        target_ohm = np.maximum(self._target_ohm[asked], 0.5 * skin.least_ohm[asked])
+        target_ohm = np.maximum(self._target_ohm, 0.5 * skin.least_ohm)
         # One cell more is a change of rank 1. It lowers rho to the target, and so
         # rho - target = slope / (1 / d + M), which is solved for 1 / d.
-        missing_ohm = np.maximum(self._touched.port_ohm[asked] - target_ohm, 1e-9)
+        missing_ohm = np.maximum(self._touched.port_ohm - target_ohm, 1e-9)
         added_ohm = slope / missing_ohm - cell_volt
-        added_siemens = 1.0 / np.maximum(added_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
-        added_of_cells = np.zeros(skin.net.shape)
-        added_of_cells.ravel()[asked] = added_siemens
-        of_lines = added_of_cells.max(axis=1, keepdims=True), added_of_cells.max(axis=0)
-        rival = np.maximum(*of_lines).ravel()[asked]
-        counts = added_siemens >= RIVAL_SHARE * rival
-        return asked[counts], added_siemens[counts]
+        added_siemens = asks / np.maximum(added_ohm, 1.0 / HIGHEST_TOUCH_SIEMENS)
+        of_lines = added_siemens.reshape(skin.net.shape)
+        rival = np.maximum(of_lines.max(axis=1, keepdims=True), of_lines.max(axis=0))
+        asks &= added_siemens >= RIVAL_SHARE * rival.ravel()
+        asked = asks.nonzero()[0]
+        return asked, added_siemens[asked]
 
     @property
     def log_cells(self) -> Float:
@@ -460,9 +466,11 @@ class FewTouches:
             pull = light_slopes @ self._residual[light] + solve_lower(factor, residual) @ whitened
             moved, is_last = self._stepped(system, pull)
             least = self._skin.least_log_siemens[self.cells]
-            self._place(self.cells, np.minimum(np.maximum(moved, least), _MAX_LOG_SIEMENS))
-            if is_last:
+            moved = np.minimum(np.maximum(moved, least), _MAX_LOG_SIEMENS)
+            if is_last:  # what it leaves out is next to nothing: so no new network
+                self._forecast(moved, slopes)
                 break
+            self._place(self.cells, moved)
         residual = self._residual[ports] - offset
         probable_noise = solve(factor, residual)
         if residual @ probable_noise > MAX_CHI2 * ports.size:

@@ -99,7 +99,8 @@ def without_means(log_std: Float, by_means_std: Float, belief: "WireBelief") -> 
     log_std: deviation of the log resistance, (k,). by_means_std: the parts of it that come from the
     means of both layers and the mean lead, as the fit took them from this belief, (k, 3).
     """
-    own = np.sqrt(np.maximum(log_std**2 - (by_means_std**2).sum(axis=1), 0.0))
+    of_means = np.einsum("ij,ij->i", by_means_std, by_means_std)
+    own = np.sqrt(np.maximum(log_std * log_std - of_means, 0.0))
     return own, np.abs(by_means_std) / belief.means_std()[:3]
 
 
