@@ -129,6 +129,19 @@ def test_told_wires_are_one_more_piece_of_evidence(factor: float, disagrees: boo
     assert found.wires.bottom == pytest.approx(factor * 600.0, rel=0.35)
 
 
+@pytest.mark.parametrize(("told_ohm", "disagrees"), [(300.0, False), (1200.0, True)])
+@pytest.mark.parametrize("layers", [(None, None), (100.0, 200.0)])
+def test_a_lead_that_was_told_wrongly_moves_no_wires(
+    told_ohm: float, disagrees: bool, layers: tuple[float | None, float | None]
+) -> None:
+    """Believed, a lead of 1200 ohm would leave nothing for the wires: 19 ohm for 100."""
+    of, cells = skin((5, 4), 100.0, 200.0, 300.0), list(range(20))
+    found = found_by(of, WireOhm(*layers, told_ohm), cells, 0.2)
+    assert found.wires.both == pytest.approx((100.0, 200.0), rel=0.15)
+    assert found.wires.lead == pytest.approx(300.0, abs=150.0)
+    assert (found.disagrees, found.lead_disagrees) == (False, disagrees)
+
+
 @pytest.mark.parametrize("factor", [1e-5, 0.01, 100.0, 1000.0])
 def test_wires_that_were_told_in_another_unit_count_for_nothing(factor: float) -> None:
     """Near 0 ohm, presses have no slope by the log of wires: a fit that is there stays there."""

@@ -2,6 +2,7 @@
 """``ohmskin skin``."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -10,6 +11,7 @@ import pytest
 
 from calibrations import of_scene
 from command_line import Run, assert_one_line, well
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
 
 
@@ -30,6 +32,19 @@ def test_it_says_and_changes_where_cells_are(file: Path, run: Run) -> None:
     assert np.hypot(*known.position_m[..., [0, 2]].T) == pytest.approx(0.04)
     well(run("skin", str(file), "--frame", "wrist"))
     assert load_calibration(file).geometry.frame_id == "wrist"
+
+
+def test_it_says_what_is_known_of_the_wires(file: Path, run: Run) -> None:
+    for wires, words in (
+        (WireOhm(), "wires of ? (top) and ? (bottom) ohm a segment, leads of ? ohm"),
+        (WireOhm(100.0, 200.0, 80.0), "wires of 100 (top) and 200 (bottom) ohm a segment"),
+        (
+            WireOhm(100.0, 200.0, 80.0, 0.1, 0.02, 30.0),
+            "wires of 100 +- 10 (top) and 200 +- 4 (bottom) ohm a segment, leads of 80 +- 30 ohm",
+        ),
+    ):
+        replace(load_calibration(file), nominal_wire_ohm=wires).save(file)
+        assert words in " ".join(well(run("skin", str(file))).out.split())
 
 
 def test_it_draws_every_cell(file: Path, run: Run, tmp_path: Path) -> None:

@@ -197,6 +197,10 @@ def test_nobody_presses(run: Run, benches: list[SteppedSkin]) -> None:
     assert "nobody pressed" in answer["verdict"]
     assert answer["measured"]["wires"] == "not known: no three corners of a rectangle were pressed"
     assert benches[0].now_s < 40
+    done = run("doctor", "emulator://8x8?scene=single&begin=0", "--press", "--json")
+    answer = json.loads(done.out)
+    assert (done.code, answer["sound"]) == (1, False)
+    assert "something touches the skin" in answer["verdict"]
 
 
 @pytest.mark.usefixtures("benches")
@@ -246,10 +250,22 @@ def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path
     kept = load_calibration(path).nominal_wire_ohm
     assert kept.both == pytest.approx((150, 300), rel=0.07)
     assert (kept.top_log_std, kept.bottom_log_std) == pytest.approx((0.04, 0.04), abs=0.035)
-    assert kept.lead == LEAD_OHM
+    assert (kept.lead, kept.lead_std_ohm) == (LEAD_OHM, None)
     # The curves are of the wires that presses showed, so badly that hardly any of it is stretch.
     assert kept[6:8] == pytest.approx((100 * 1.5**0.07, 200 * 1.5**0.07), rel=0.01)
     assert_one_line(run("doctor", url, "--into", str(path)), "--press")
+    # Presses tell both layers together: neither gets surer than it was, and a lead that is told now
+    # has no deviation of the one before.
+    by_presses = WireOhm(150.0, 300.0, 46.0, 0.01, 0.2, 125.0)
+    replace(told, nominal_wire_ohm=by_presses).save(path)
+    assert run("doctor", url, "--press", "--into", str(path)).code == 0
+    kept = load_calibration(path).nominal_wire_ohm
+    assert kept.both == pytest.approx((150, 300), rel=0.1)
+    assert 0.02 < kept.top_log_std < 0.1
+    assert (kept.bottom_log_std, kept.lead, kept.lead_std_ohm) == (0.2, 46.0, 125.0)
+    assert run("doctor", url, "--leads", "80", "--press", "--into", str(path)).code == 0
+    kept = load_calibration(path).nominal_wire_ohm
+    assert (kept.lead, kept.lead_std_ohm) == (80.0, None)
 
 
 @pytest.mark.parametrize("end", [None, KeyboardInterrupt, RuntimeError])

@@ -174,9 +174,31 @@ def test_presses_that_tell_nothing_are_said_to() -> None:
     assert not any(each.differs or each.known for each in shares)
     said = measured_in_words(Diagnosis(nominal_ohm=NOMINAL, pressed=shares))
     assert said["wires"].startswith("not known: press with something smaller")
+    asked = Diagnosis(nominal_ohm=NOMINAL, pressed=shares)
+    assert not asked.sound
+    assert verdict(asked).endswith("these presses do not show the wires: see 'wires'")
     nothing = taken(readings(skin))
     assert nothing.pressed == ()
     assert nothing.measure(rest_of(skin)) == []
+
+
+def test_nominal_wires_that_nobody_has_told_are_said_to_be_none() -> None:
+    [whole] = shares_of([((1, 1), 0.9, 0.05)])[:1]
+    for is_told in (True, False):
+        shown = Diagnosis(nominal_ohm=NOMINAL, is_told=is_told, pressed=[whole])
+        assert ("say --wires" in measured_in_words(shown)["wires"]) is not is_told
+        assert shown.sound
+
+
+@pytest.mark.parametrize(
+    ("lead_ohm", "std_ohm", "taken"),
+    [(46.0, 125.0, (100.0, 40.0)), (967.0, 148.0, (967.0, 148.0)), (80.0, 10.0, (80.0, 10.0))],
+)
+def test_a_lead_that_presses_hardly_tell_is_that_of_a_switch(
+    lead_ohm: float, std_ohm: float, taken: tuple[float, float]
+) -> None:
+    rest = rest_of(worn("3x3", 1.0, seed=0))
+    assert replace(rest, told=WireOhm(lead=lead_ohm, lead_std_ohm=std_ohm)).lead_ohm == taken
 
 
 def test_what_is_hardly_known_is_no_finding() -> None:

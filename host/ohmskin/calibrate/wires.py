@@ -44,8 +44,8 @@ N is the noise of the readings, * multiplies by elements, and [...] is 1 where i
 The fit minimises (y - y(p))^T C^-1 (y - y(p)) and the priors of p. Between such fits, the variances
 v are replaced by the most likely ones. Two leads and r lie in series, so presses tell their sum
 alone, and the prior of r divides it: what is above the usual r is taken for the leads. The
-covariance of p is that of least squares. Layers that were told are tried as told and as never told,
-the leads as told, and the more probable one of both is the answer (`WRONGLY_TOLD`).
+covariance of p is that of least squares. Layers that were told, and leads, are tried as told and as
+never told, and the most probable of these is the answer (`WRONGLY_TOLD`).
 """
 
 from dataclasses import dataclass, replace
@@ -169,6 +169,14 @@ class FoundWires:
             if told is not None and ohm is not None
         )
 
+    @property
+    def lead_disagrees(self) -> bool:
+        """Whether a lead was told and another is found, by more than both deviations explain."""
+        told_ohm, told_std_ohm = self.told.lead_or_usual(0.0)
+        std_ohm = np.hypot(told_std_ohm, self.wires.lead_std_ohm or 0.0)
+        apart_ohm = abs((self.wires.lead or 0.0) - told_ohm)
+        return self.told.lead is not None and bool(apart_ohm > REACH_STDS * std_ohm)
+
 
 class _Rows(NamedTuple):
     """Arrays (n,) of the module's table. variance: of y, by the readings' noise."""
@@ -208,13 +216,12 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     assert knowledge.rest_ratio is not None
     rest = PortReader(knowledge).read(knowledge.rest_ratio)
     rows = _rows(readings, rest.current.ravel())
-    told, fits = knowledge.nominal_wire_ohm, [(0.0, knowledge)]
-    if told[:2] != (None, None):
-        of_lead = WireOhm(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
-        untold = replace(knowledge, nominal_wire_ohm=of_lead)
-        fits.append((-2 * np.log(WRONGLY_TOLD), untold))
-    tried = []
-    for cost, known in fits:
+    told = knowledge.nominal_wire_ohm
+    of_lead = WireOhm(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
+    of_layers, wrong = told._replace(lead=None, lead_std_ohm=None), -2 * float(np.log(WRONGLY_TOLD))
+    costs, tried = {of_lead: wrong, of_layers: wrong, told: 0.0}, []
+    for wires, cost in costs.items():
+        known = replace(knowledge, nominal_wire_ohm=wires)
         fit = _PressFit(known, rows, rest.current.ravel(), rest.current_std.ravel())
         tried += [(cost + found[0], *found[1:]) for found in map(fit.minimised, STARTS_OHM)]
     p, covariance = min(tried, key=lambda found: found[0])[1:]

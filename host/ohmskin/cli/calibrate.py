@@ -23,6 +23,7 @@ from ohmskin.calibrate.rules import check_cells_differ, check_enough
 from ohmskin.calibrate.scale import printed_s, wrong_numbers
 from ohmskin.calibrate.sessions import beside, check_same, joined, session_paths
 from ohmskin.calibrate.tables import ForceLog, load_force_log, load_press_table
+from ohmskin.calibrate.wires import UNCLEAR_LOG
 from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
 from ohmskin.cli.knead import kneaded
 from ohmskin.cli.record import TRUTH, ForceBaud, ForceColumn, ForceScale, ForceUnit, progress
@@ -65,7 +66,7 @@ Indenter = Annotated[
     float, Option("--indenter-mm2", help="area that the skin is pressed with, in mm2")
 ]
 AnyIndenter = Annotated[
-    float | None, Option("--indenter-mm2", help="the same, where single cells are pressed")
+    float | None, Option("--indenter-mm2", help="area of what presses single cells, in mm2")
 ]
 Force = Annotated[bool, Option("--force", help="even if cells seem to be touched at rest")]
 # Makes a calibrator, from what the board says of itself and the readings (R, C, 4) of its untouched
@@ -492,22 +493,24 @@ def _finish(
 
 def _conclude(calibration: Calibration, calibrator: Calibrator, out: Path) -> None:
     """Say what was written. The largest force shows it if a sensor's newtons are none."""
-    TERMINAL.print(_wires_in_words(calibration.nominal_wire_ohm, calibrator))
+    TERMINAL.print(_wires_in_words(calibration, calibrator))
     of = f"{out}: calibration of unit {calibration.unit_id}"
     TERMINAL.print(f"{of}, by presses up to {calibration.largest_force_n:.3g} N")
 
 
-def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
+def _wires_in_words(calibration: Calibration, calibrator: Calibrator) -> str:
     """What the calibration keeps of the wires, and what has shown them."""
-    found = calibrator.found
-    if wires.both is None:
-        why = (
-            "a table without readings does not show them: say --wires, or calibrate by a recording"
-        )
-        return f"wires are not known, and {why}: forces' standard deviations are wide"
-    line = f"wires: {wires.top:.0f} and {wires.bottom:.0f} ohm a segment"
+    wires, found = calibration.nominal_wire_ohm, calibrator.found
     lead_ohm = wires.lead if found is None else found.told.lead
     leads = "" if lead_ohm is None else f"; leads of {lead_ohm:g} ohm, as told"
+    if wires.both is None:
+        by = "" if calibration.mode == "far" else " --press --wires 100,200"
+        return (
+            f"wires are not known, and a table without readings does not show them{leads}: forces' "
+            f"standard deviations are wide. 'ohmskin doctor PORT{by} --into FILE' measures them, "
+            "and a recording shows them"
+        )
+    line = f"wires: {wires.top:.0f} and {wires.bottom:.0f} ohm a segment"
     if wires.top_log_std is None or wires.bottom_log_std is None:
         return f"{line}, as told{leads}"
     percent = [f"{100 * std:.0f} %" for std in (wires.top_log_std, wires.bottom_log_std)]
@@ -518,11 +521,16 @@ def _wires_in_words(wires: WireOhm, calibrator: Calibrator) -> str:
     if found.told.both is not None:
         words = "they disagree" if found.disagrees else "they agree"
         line += f"; told: {found.told.top:g}, {found.told.bottom:g}: {words}"
+    ohm, std_ohm = wires.lead or 0.0, wires.lead_std_ohm or 0.0
+    if found.lead_disagrees:
+        leads = f"; leads of {ohm:.0f} ohm; told: {lead_ohm:g}: they disagree"
+    elif lead_ohm is None and std_ohm < UNCLEAR_LOG * ohm:
+        leads = f"; leads of {ohm:.0f} ohm, {100 * std_ohm / ohm:.0f} %"
     line += leads
     if found.unclear:
-        layers = " and ".join(found.unclear)
-        line += (
-            f"\npresses tell little of the wires of the {layers} layer: press hard, cells near its "
-            "electrodes and cells far from them"
-        )
+        ends = {"top": f"columns 0 and {calibration.columns - 1}"}
+        ends["bottom"] = f"rows 0 and {calibration.rows - 1}"
+        line += f"\npresses tell little of the wires of the {' and '.join(found.unclear)} layer: "
+        line += f"press {', '.join(ends[layer] for layer in found.unclear)} hard"
+        line += " or tell --leads" if lead_ohm is None else ""
     return line

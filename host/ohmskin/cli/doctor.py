@@ -48,14 +48,17 @@ def doctor(
     Takes under 10 s, but for --press, and leaves the board as it was. --press measures the wires:
     it says when and where to press. Any rectangle will do: its lines are measured. In mode far, the
     wires of all lines are measured without, and --into takes them. Exit code 0: sound; 1: something
-    is wrong, or nobody pressed.
+    is wrong, or --press has shown no wires.
     """
     paths = filter(None, (calibration, into))
     known = [load_calibration(path) for path in paths]  # the first one tells the wires
     told = wires_of(wires, leads)
-    if known:
-        given = {name: ohm for name, ohm in told._asdict().items() if ohm is not None}
-        told = known[0].nominal_wire_ohm._replace(**given)
+    if known:  # what is told now has no deviation of what was told before
+        before = known[0].nominal_wire_ohm
+        if told.lead is None:
+            told = told._replace(lead=before.lead, lead_std_ohm=before.lead_std_ohm)
+        if told.both is None:
+            told = before._replace(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
     with terminal() as report:
         try:
             device = ohmskin.open(port, start=False)
@@ -69,7 +72,9 @@ def doctor(
                     if press:
                         raise ValueError("mode far shows the wires untouched: leave out --press")
                 elif into is not None and not (press and told.both):
-                    raise ValueError("in mode near, --into needs --press and nominal --wires")
+                    raise ValueError(
+                        "in mode near, --into needs --press, and nominal wires, as --wires 100,200"
+                    )
                 evidence = gather(device, report, told, press=press)
             diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
@@ -87,11 +92,15 @@ def _keep_wires(diagnosis: Diagnosis, told: WireOhm, into: Path) -> None:
     """Write the wires that presses or far ends showed into a calibration, with their deviation.
 
     told: the wires that were told. Their leads are kept where only far ends could have shown leads.
+    Presses have compared both layers with them, so that neither is known better than their ratio.
     """
     wires = measured_wires(diagnosis)
     if wires is None:
         raise ValueError(f"{into} is as it was: neither presses nor far ends have told the wires")
     if wires.lead is None:
+        pairs = zip(wires[3:5], told[3:5], strict=True)
+        top_std, bottom_std = (max(std or 0.0, of_told or 0.0) for std, of_told in pairs)
+        wires = wires._replace(top_log_std=top_std, bottom_log_std=bottom_std)
         wires = wires._replace(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
     calibration = load_calibration(into)
     wires = wires.for_curves_of(calibration.nominal_wire_ohm)

@@ -111,6 +111,8 @@ def verdict(diagnosis: Diagnosis) -> str:
         return "no fault found, but something touches the skin: let go, and run this again"
     if diagnosis.pressed == []:
         return "no fault found, but nobody pressed three corners of a rectangle: run this again"
+    if diagnosis.pressed and diagnosis.wires_hidden:
+        return "no fault found, but these presses do not show the wires: see 'wires'"
     if diagnosis.wires_hidden:
         return "sound: nothing is wrong that an untouched skin shows; --press shows its wires"
     return "sound: nothing is wrong"
@@ -123,6 +125,8 @@ def measured_in_words(diagnosis: Diagnosis) -> dict[str, Any]:
     wires, pressed = _UNTOUCHED, diagnosis.pressed
     if pressed is not None:
         wires = _ohm(pressed[0], diagnosis.nominal_ohm) if pressed else _NOT_PRESSED
+        if not (diagnosis.is_told or diagnosis.wires_hidden):
+            wires += ". Nobody has told what is nominal: say --wires"
     lines = [f"{named(share.place)}: {_times(share)}" for share in (pressed or ())[1:]]
     return {**diagnosis.measured, "wires": wires, "wires_of_lines": lines}
 

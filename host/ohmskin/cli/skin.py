@@ -11,6 +11,7 @@ from typer import Argument, Option
 
 from ohmskin.cli.board import TERMINAL
 from ohmskin.cli.picture import check_picture, picture
+from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.geometry import Geometry
 
@@ -55,6 +56,7 @@ def skin(
     size, tare = f"{known.rows}x{known.columns} cells", known.tare and f", tared {known.tare.date}"
     TERMINAL.print(f"{file}: unit {known.unit_id}, {size}, mode {known.mode}")
     TERMINAL.print(f"calibrated {known.date} by '{known.method}'{tare or ''}")
+    TERMINAL.print(_wires_in_words(known.nominal_wire_ohm))
     if placed is None:
         TERMINAL.print("nobody has said where the cells are: --pitch-mm 10,10 does")
         return
@@ -63,6 +65,17 @@ def skin(
     TERMINAL.print(f"{placed.kind}, in '{placed.frame_id}': from ({first}) to ({last}) mm")
     if drawing is not None:
         _draw(drawing, placed)
+
+
+def _wires_in_words(wires: WireOhm) -> str:
+    """Wires and leads, and how well they are known."""
+    stds = (ohm and std and ohm * std for ohm, std in zip(wires[:2], wires[3:5], strict=True))
+    numbers = zip(wires[:3], (*stds, wires.lead_std_ohm), strict=True)
+    top, bottom, lead = (
+        "?" if ohm is None else f"{ohm:.0f}{f' +- {std:.0f}' if std else ''}"
+        for ohm, std in numbers
+    )
+    return f"wires of {top} (top) and {bottom} (bottom) ohm a segment, leads of {lead} ohm"
 
 
 def _draw(path: Path, placed: Geometry) -> None:

@@ -95,6 +95,7 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
         if is_too_short or far or stands_still:
             scans = settled
     if presses is not None:
+        diagnosis.pressed = []  # until they are measured
         presses.examine_settling(evidence.pressed, diagnosis)
     told = evidence.told
     rest = Rest(scans.board, scans.mean, len(scans.codes), noise_lsb, moves=moves, told=told)
@@ -113,11 +114,11 @@ def examine_skin(evidence: Evidence, usual: Look, diagnosis: Diagnosis) -> None:
         examine_leaks(at_near, diagnosis)
     if far or touched.any() or near.wrong.any():
         return  # far ends show the wires, or touches and faults hide them
-    diagnosis.nominal_ohm = rest.wire_ohm
+    diagnosis.nominal_ohm, diagnosis.is_told = rest.wire_ohm, told.both is not None
     if presses is not None:
         diagnosis.pressed = presses.measure(rest)
     for share in diagnosis.pressed or ():
-        if share.differs and told.both is not None:  # else nobody says what is nominal
+        if share.differs and diagnosis.is_told:
             diagnosis.add(Kind.WIRES, share.place, share=share, nominal_ohm=rest.wire_ohm)
 
 

@@ -211,8 +211,9 @@ class Diagnosis:
     findings: all that was found.
     measured: figures by name, None for one that could not be had.
     nominal_ohm: nominal wires of a segment, top and bottom; None if touches or faults hide wires.
+    is_told: whether somebody has told what is nominal.
     pressed: the share of all wires that presses show, then that of each row and column; empty if
-        nobody pressed, None if nobody was asked to.
+        nobody pressed, or if touches or faults hide the wires; None if nobody was asked to.
     lines: wires of the lines, where far ends show them.
     wires_by_far_ends: a segment of each layer and the leads, where far ends show both layers.
     """
@@ -220,6 +221,7 @@ class Diagnosis:
     findings: list[Finding] = field(default_factory=list)
     measured: dict[str, Any] = field(default_factory=dict)
     nominal_ohm: tuple[float, float] | None = None
+    is_told: bool = True
     pressed: list[WireShare] | None = None
     lines: list[LineWire] = field(default_factory=list)
     wires_by_far_ends: WireOhm | None = None
@@ -236,9 +238,13 @@ class Diagnosis:
     @property
     def sound(self) -> bool:
         """Whether nothing is wrong, and all was done that was asked for."""
-        return not self.worse and self.pressed != []
+        return not self.worse and (self.pressed is None or self._shows_wires)
 
     @property
     def wires_hidden(self) -> bool:
         """Whether no press has told the wires, though no touch or fault hides them."""
-        return self.nominal_ohm is not None and not (self.pressed and self.pressed[0].known)
+        return self.nominal_ohm is not None and not self._shows_wires
+
+    @property
+    def _shows_wires(self) -> bool:
+        return self.pressed is not None and any(share.known for share in self.pressed[:1])

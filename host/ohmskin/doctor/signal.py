@@ -39,6 +39,7 @@ from ohmskin.doctor.limits import ALL_STDS, NOISY_LSB, ROUNDING_LSB, SWITCH_LEAD
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, TOP_WIRE_OHM
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
+from ohmskin.estimate.prior import REACH_STDS, UNKNOWN_LEAD_OHM
 from ohmskin.link.clock import slot_s
 from ohmskin.link.codes import ratio_from_codes
 from ohmskin.link.messages import Hello, Scan
@@ -195,8 +196,13 @@ class Rest:
 
     @property
     def lead_ohm(self) -> tuple[float, float]:
-        """The usual lead of all lines, and its standard deviation [ohm]."""
+        """The usual lead of all lines, and its standard deviation [ohm].
+
+        A lead that is badly known, as by presses, and that may be a switch's, is taken for one.
+        """
         ohm, std_ohm = self.told.lead_or_usual(SWITCH_LEAD_STD_OHM)
+        if std_ohm > SWITCH_LEAD_STD_OHM and abs(ohm - UNKNOWN_LEAD_OHM) < REACH_STDS * std_ohm:
+            ohm, std_ohm = UNKNOWN_LEAD_OHM, SWITCH_LEAD_STD_OHM
         return ohm, max(std_ohm, 1.0)  # 1 ohm: a precision is made of it
 
     @property
