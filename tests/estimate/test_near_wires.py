@@ -10,7 +10,7 @@ import scipy.stats
 
 from network import SkinCircuit  # tests/helpers
 from ohmskin.arrays import Float
-from ohmskin.circuit.skin import Skin
+from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.near_wires import LearnedWires
@@ -301,6 +301,28 @@ def test_frames_of_one_touch_do_not_teach_twice(method: str) -> None:
     assert known[4] == known[5]
     calm.estimate(ratio)
     assert known[4][3:5] == pytest.approx(calm.wires()[3:5], rel=0.02)
+
+
+def test_what_few_touches_model_is_what_their_circuit_gives() -> None:
+    """The last step is forecast, and the circuit not solved again. With wires of an ohm."""
+    random, shape, off_stds = np.random.default_rng(4), (8, 8), []
+    belief, wires_ohm = LearnedWires(shape, WireOhm(1.0, 1.0, 0.0)), np.ones((2, *shape))
+    rest_log, by_means = np.full(64, -np.log(5e-6)), np.zeros((64, belief.means.size))
+    prior = CellPrior(rest_log, np.full(64, REST_STD), by_means, belief.means)
+    finder = SparseFit(prior, belief, 6e4)
+    for _ in range(100):
+        cells = np.exp(-rest_log)
+        cells[random.choice(64, 6, replace=False)] = np.geomspace(1e-4, 3e-3, 6)
+        ratio = ten_bits(readings(Skin(cells.reshape(shape), *wires_ohm)))
+        ports = PortReader(told(ratio)).read(ratio)
+        few = finder.find(ports)
+        if few is not None and (touched := few.explain()):
+            answer = Skin(np.exp(-touched.log_cells).reshape(shape), *wires_ohm)
+            off = touched.modelled - 1 / (port_resistance_ohm(answer).ravel() + 6e4)
+            off[touched.cells] = 0  # what they read is noise as well
+            off_stds.append(np.abs(off / ports.current_std.ravel()).max())
+    assert len(off_stds) > 50
+    assert 1e-3 < np.max(off_stds) < 0.1
 
 
 def test_a_lesson_of_few_touches_errs_by_as_much_as_it_states() -> None:
