@@ -169,7 +169,7 @@ class WireOhm(NamedTuple):
         lead_left = 1.0 - self.told_share
         if self.both and self.lead_std_ohm:
             of_layers = change_ohm**2 + (SEGMENT_STD * sum(self.both)) ** 2
-            lead_left *= of_layers / (of_layers + self.lead_std_ohm**2)
+            lead_left = left * of_layers / (of_layers + self.lead_std_ohm**2)
         return top, bottom, max(curve_ohm + lead_left * (now[2] - told_ohm), 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
