@@ -62,7 +62,6 @@ from statistics import NormalDist
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.small import cholesky, solve_lower
@@ -85,6 +84,9 @@ SAME_TIP: Final = 0.6
 # The probability that a layer is longer than its upper limit. Chosen: less than at 2 deviations of
 # a normal, because wires that change at once are rare, and errors are large then.
 LONGER_CHANCE: Final = 0.01
+# The limit is between those of the parts. This interval is halved so often. Chosen: it is found to
+# a billionth.
+_HALVINGS: Final = 30
 
 
 class _Filter(NamedTuple):
@@ -135,13 +137,12 @@ def _exceeded(parts: Sequence[tuple[float, float, float]], chance: float) -> flo
     """
     stds = NormalDist().inv_cdf(1.0 - chance)
     alone = [mean + stds * std for _, mean, std in parts]
-
-    def too_likely(limit: float) -> float:
-        tails = (share * math.erfc((limit - mean) / std / 2**0.5) for share, mean, std in parts)
-        return 0.5 * sum(tails) - chance
-
-    # Where all parts agree, rounding must not hide that the limit is between them.
-    return float(brentq(too_likely, min(alone) - 1e-3, max(alone) + 1e-3, xtol=1e-9))
+    low, high = min(alone), max(alone)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        tails = (share * math.erfc((middle - mean) / std / 2**0.5) for share, mean, std in parts)
+        low, high = (middle, high) if 0.5 * sum(tails) > chance else (low, middle)
+    return high
 
 
 class LearnedWires(WireBelief):
