@@ -217,9 +217,12 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     rest = PortReader(knowledge).read(knowledge.rest_ratio)
     rows = _rows(readings, rest.current.ravel())
     told = knowledge.nominal_wire_ohm
-    of_lead = WireOhm(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
-    of_layers, wrong = told._replace(lead=None, lead_std_ohm=None), -2 * float(np.log(WRONGLY_TOLD))
-    costs, tried = {of_lead: wrong, of_layers: wrong, told: 0.0}, []
+    lead_alone = WireOhm(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
+    layers_alone = told._replace(lead=None, lead_std_ohm=None)
+    cost_of_wrong = -2 * float(np.log(WRONGLY_TOLD))
+    # Where nothing else was told, one of these is what was told, and costs nothing.
+    costs = {lead_alone: cost_of_wrong, layers_alone: cost_of_wrong, told: 0.0}
+    tried = []
     for wires, cost in costs.items():
         known = replace(knowledge, nominal_wire_ohm=wires)
         fit = _PressFit(known, rows, rest.current.ravel(), rest.current_std.ravel())

@@ -69,12 +69,15 @@ def skin(
 
 def _wires_in_words(wires: WireOhm) -> str:
     """Wires and leads, and how well they are known."""
-    stds = (ohm and std and ohm * std for ohm, std in zip(wires[:2], wires[3:5], strict=True))
-    numbers = zip(wires[:3], (*stds, wires.lead_std_ohm), strict=True)
-    top, bottom, lead = (
-        "?" if ohm is None else f"{ohm:.0f}{f' +- {std:.0f}' if std else ''}"
-        for ohm, std in numbers
-    )
+
+    def known(ohm: float | None, std_ohm: float) -> str:
+        if ohm is None:
+            return "?"
+        return f"{ohm:.0f} +- {std_ohm:.0f}" if std_ohm else f"{ohm:.0f}"
+
+    top = known(wires.top, (wires.top or 0.0) * (wires.top_log_std or 0.0))
+    bottom = known(wires.bottom, (wires.bottom or 0.0) * (wires.bottom_log_std or 0.0))
+    lead = known(wires.lead, wires.lead_std_ohm or 0.0)
     return f"wires of {top} (top) and {bottom} (bottom) ohm a segment, leads of {lead} ohm"
 
 
