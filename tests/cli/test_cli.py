@@ -22,6 +22,7 @@ from ohmskin.emulate.faults import LINE_FAULTS, SKIN_FAULTS
 from ohmskin.emulate.scale import SCALE_OPTIONS
 from ohmskin.emulate.scenes import BEGIN_S, LEAD_OHM, SCENES, Scene
 from ohmskin.estimate.methods import METHODS
+from ohmskin.force.reader import DEFAULT_METHOD
 from ohmskin.link.codes import quantise, ratio_from_codes
 from ohmskin.link.device import Region
 from ohmskin.link.messages import SelfTestReport
@@ -240,13 +241,14 @@ def test_stream_ends_when_its_reader_does(command: Command) -> None:
         assert process.wait(20) == 0
 
 
-@pytest.mark.parametrize("method", ["ohm", "matrix"])
+@pytest.mark.parametrize("method", ["ohm", "matrix", DEFAULT_METHOD])
 @pytest.mark.parametrize("cold", [False, True])
 def test_estimate(run: Run, tmp_path: Path, method: str, cold: bool) -> None:
     out = tmp_path / "out.npz"
     done = run(
-        *("estimate", str(DATA / "random_4x6.npz"), "--method", method, "--out", str(out)),
+        *("estimate", str(DATA / "random_4x6.npz"), "--out", str(out)),
         *(["--cold"] if cold else []),
+        *(["--method", method] if method != DEFAULT_METHOD else []),
     )
     assert done.code == 0
     assert "converged" in done.out
@@ -381,7 +383,7 @@ TAKES = {
     "doctor": "PORT --calibration --wires --leads --press --into --json",
     "verify": "PORT PLATE --wires --leads --seconds --picture --json --cell-percent "
     "--reference-percent --settling-lsb --loss",
-    "estimate": "READINGS --method --out --cold --ref-std",
+    "estimate": "READINGS --out --method --cold --ref-std",
     "record": "PORT FILE --scans --seconds --tare --mark --force-port --force-baud --force-scale"
     " --force-unit --force-column",
     "export": "RECORDING OUT --begin --end --calibration --force --format --backend",

@@ -242,6 +242,9 @@ def test_what_no_board_leaves_out_is_refused() -> None:
         estimator.estimate(np.full((8, 8, 4), np.nan))
     with pytest.raises(ValueError, match="rest_ratio has cells without any reading"):
         knowledge(of_region(rest, slice(1, 6), slice(1, 6), READ["near"]))
+    far = make_estimator("joint", SkinKnowledge(8, 8, reading_names=("a", "e", "b", "f")))
+    with pytest.raises(ValueError, match=r"reading E, is nan: .* leave other modes out"):
+        far.estimate(of_region(frames[0], slice(None), slice(None), (0, 2)))
 
 
 def test_two_readings_of_a_cell_are_worth_the_mean_of_two() -> None:

@@ -326,8 +326,8 @@ def _at_once(
 
 def estimate(
     readings: Annotated[Path, Argument(help="readings file (.npz)")],
-    method: Annotated[str, Option(help=" | ".join(METHODS))],
     out: Annotated[Path, Option(help="file to write (.npz)")],
+    method: Annotated[str, Option(help=" | ".join(METHODS))] = DEFAULT_METHOD,
     cold: Annotated[bool, Option("--cold", help="start every frame afresh")] = False,
     ref_std: Annotated[float | None, REF_STD] = None,
 ) -> None:

@@ -314,10 +314,11 @@ def check_ratio(
         good |= np.isnan(readings) & ~_read_of_lines(readings)
     if not good.all():
         row, column, k = (int(index) for index in np.argwhere(~good)[0])
-        raise ValueError(
-            f"{name} of cell ({row}, {column}), reading {of[k].upper()}, is "
-            f"{readings[row, column, k]:g}, not in 0..1"
-        )
+        read = readings[row, column, k]
+        text = f"{name} of cell ({row}, {column}), reading {of[k].upper()}, is {read:g}"
+        if np.isnan(read) and not of_near:
+            raise ValueError(f"{text}: beside far ends, all is read: leave other modes out")
+        raise ValueError(f"{text}, not in 0..1")
     return readings
 
 

@@ -284,14 +284,15 @@ class SkinReader:
         estimator = self._shared.estimator(self._wanted, self.rest)
         estimate = estimator.estimate(rest_ratio)
         if estimate.touched.any() and not force:
-            remedy = "take everything off the skin, or force the tare if nothing is on it"
+            remedy = "take everything off the skin; if nothing is on it: ohmskin tare --force"
             raise TareRefused(touched_cells(estimate.touched), remedy)
         if self.rest is not None and not force:
             # By deviations less: a rest may be too small to be measured.
             open_level = _OPEN_SHARE * estimator.rest_level() - 2 * estimate.level_std
             if np.mean(estimate.level < open_level) > 0.5:
                 text = f"most cells conduct less than {_OPEN_SHARE:.0%} of what they did at rest"
-                raise TareRefused(text, "connect the skin, or force the tare if it is connected")
+                remedy = "connect the skin; if it is connected: ohmskin tare --force"
+                raise TareRefused(text, remedy)
         self._shared.rests.append(Untouched(rest_ratio, now()))
         return self._to_record(rest_ratio)
 
