@@ -3,6 +3,8 @@
 
 import csv
 import json
+import os
+import signal
 import sys
 from dataclasses import replace
 from itertools import islice
@@ -15,6 +17,7 @@ import ohmskin
 from calibrations import of_scene
 from command_line import Run, assert_one_line, well
 from ohmskin.errors import OhmskinError, RecordingError
+from ohmskin.force import tables
 from ohmskin.force.reader import ForceScan
 from ohmskin.force.tables import export, load_forces, read_forces
 from ohmskin.record.export import Part
@@ -206,6 +209,21 @@ def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: R
     assert_one_line(run(*words[:-2], "--format", "xyz"), "no format '.xyz'")
     done = run("export", str(recorded), str(again), str(tmp_path / "one.npz"))
     assert (done.code, "a folder takes several recordings" in done.err) == (2, True)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no process is killed so")
+def test_a_process_that_is_killed_is_said_in_a_line(
+    recorded: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("joblib")
+    (again := tmp_path / "b.mcap").write_bytes(recorded.read_bytes())
+
+    def killed(*_: object, force: bool) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    monkeypatch.setattr(tables, "export_or_why_not", killed)
+    done = run("export", str(recorded), str(again), str(tmp_path))
+    assert_one_line(done, "a process that wrote one of the files was ended")
 
 
 def test_readings_are_exported_where_the_environment_names_a_calibration(

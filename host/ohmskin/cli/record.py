@@ -304,6 +304,8 @@ def _at_once(
     pairs: list[tuple[Path, Path]], backend: str, *told: Any, force: bool
 ) -> list[Part | str]:
     """Each of these recordings to its file, by all cores, or by a cluster that joblib knows."""
+    from concurrent.futures.process import BrokenProcessPool  # takes long to load
+
     try:
         import joblib
 
@@ -322,6 +324,9 @@ def _at_once(
     except ImportError as exc:
         needed = "joblib" if exc.name == "joblib" else "'dask[distributed]'"
         raise OhmskinError(f"this needs {needed}: run pip install {needed}") from exc
+    except BrokenProcessPool as exc:
+        ended = "a process that wrote one of the files was ended, as a system ends one"
+        raise OhmskinError(f"{ended} where memory is short: export fewer at once") from exc
 
 
 def estimate(
