@@ -112,12 +112,17 @@ class LiveSkin(Closing):
         return str(self.failure or f"{self.port} {said}")
 
     def newest(self) -> ForceScan | None:
-        """The newest scan, at once; None if there is none yet."""
+        """The newest scan, at once; None if there is none yet.
+
+        It stays when the board goes away: `failure` says so, and `ForceScan.time_ns` how old it is.
+        """
         with self._changed:
             return self._kept[-1] if self._kept else None
 
     def since(self, count: int, timeout_s: float = 0.0) -> tuple[int, list[ForceScan]]:
         """The count to ask with next, and every scan after the first `count` scans, each once.
+
+        Scans that were passed over (`skipped`) are not among them: their numbers are missing.
 
         timeout_s: how long to wait [s] if there is no such scan yet.
         """
@@ -127,7 +132,7 @@ class LiveSkin(Closing):
             return self._count, list(islice(self._kept, begin, None))
 
     def __iter__(self) -> Iterator[ForceScan]:
-        """Every scan from now on, until `close`; also after the board was away.
+        """Every scan from now on, until `close`, as `since`; also after the board was away.
 
         An iterator that falls behind by more than `QUEUE_SCANS` loses the oldest scans, which its
         next one counts as missed.

@@ -6,6 +6,7 @@ import os
 import re
 import select
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -172,11 +173,12 @@ def test_stream_json_is_one_object_a_scan(run: Run) -> None:
     scans = [json.loads(line) for line in done.out.splitlines()]
     assert [scan["scan"] for scan in scans] == list(range(scans[0]["scan"], scans[0]["scan"] + 7))
     expected = Scene("ghost", 4, 6, seed=2).ratio(BEGIN_S)
-    bare = {"scan", "time_us", "host_time_s", "missed", "reading_names", "ratio"}
+    bare = {"scan", "time_us", "time_ns", "host_time_s", "missed", "reading_names", "ratio"}
     estimate = {"method", "cell_siemens", "cell_siemens_std", "converged", "message", "wires"}
     for scan in scans:
         assert set(scan) == bare | estimate
         assert scan["missed"] == 0
+        assert 0 < time.time_ns() - scan["time_ns"] < 60e9
         assert (scan["method"], scan["wires"]) == ("joint", "assumed")
         assert np.shape(scan["ratio"]) == (4, 6, 4)
         assert np.shape(scan["cell_siemens"]) == (4, 6)

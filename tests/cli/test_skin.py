@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ohmskin skin``."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +33,22 @@ def test_it_says_and_changes_where_cells_are(file: Path, run: Run) -> None:
     assert np.hypot(*known.position_m[..., [0, 2]].T) == pytest.approx(0.04)
     well(run("skin", str(file), "--frame", "wrist"))
     assert load_calibration(file).geometry.frame_id == "wrist"
+
+
+def test_stream_says_where_contacts_are(file: Path, run: Run) -> None:
+    words = ("stream", "emulator://8x8?scene=ghost&begin=0", "--calibration", str(file), "--json")
+    line = json.loads(well(run(*words, "--scans", "1")).out)
+    assert not {"net_force_n", "net_torque_nm"} & set(line)
+    assert not {"position_m", "normal"} & set(line["contacts"][0])
+    well(run("skin", str(file), "--pitch-mm", "10,20"))
+    line = json.loads(well(run(*words, "--scans", "1")).out)
+    found = [contact["position_m"] for contact in line["contacts"]]
+    expected = [[0.01 * each["column"], 0.02 * each["row"], 0.0] for each in line["contacts"]]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert {tuple(each["normal"]) for each in line["contacts"]} == {(0.0, 0.0, 1.0)}
+    of_contacts = sum(each["force_n"] for each in line["contacts"])
+    assert line["net_force_n"][2] == pytest.approx(-of_contacts, rel=0.1)
+    assert np.shape(line["net_torque_nm"]) == (3,)
 
 
 def test_it_says_what_is_known_of_the_wires(file: Path, run: Run) -> None:

@@ -44,9 +44,10 @@ DISPLAY_EVERY_S: Final = 0.1
 # Time between two pictures in a file or a pipe [s]. Chosen: pictures are kept there, and ten times
 # fewer can still be read.
 _PRINT_EVERY_S: Final = 1.0
-# What --json tells of an estimate, and of a contact.
+# What --json tells of an estimate, and of a contact; and where a contact is, if anybody knows.
 _OF_ESTIMATE: Final = ("cell_siemens", "cell_siemens_std", "converged", "message", "wires")
 _OF_CONTACT: Final = ("identity", "row", "column", "force_n", "force_n_std")
+_OF_PLACE: Final = ("position_m", "normal")
 
 
 def stream(
@@ -107,6 +108,7 @@ def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan])
         line: dict[str, Any] = {
             "scan": scan.number,
             "time_us": scan.time_us,
+            "time_ns": scan.time_ns,
             "host_time_s": round(scan.host_time_s, 6),
             "missed": scan.missed,
             "reading_names": scan.reading_names,
@@ -118,10 +120,13 @@ def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan])
             line |= {name: getattr(shown.estimate, name) for name in _OF_ESTIMATE}
             if reader.has_forces:
                 line |= {"force_n": shown.force_n, "force_n_std": shown.force_n_std}
+                names = _OF_CONTACT if shown.geometry is None else _OF_CONTACT + _OF_PLACE
                 line["contacts"] = [
-                    {name: numbers(getattr(contact, name)) for name in _OF_CONTACT}
+                    {name: numbers(getattr(contact, name)) for name in names}
                     for contact in shown.contacts
                 ]
+                if shown.geometry is not None:
+                    line["net_force_n"], line["net_torque_nm"] = shown.wrench
                 if skin.true_force_n is not None:
                     line["true_force_n"] = skin.true_force_n(scan)
         try:

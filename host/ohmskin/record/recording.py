@@ -233,6 +233,8 @@ class Recording:
 def load_recording(path: PathName) -> Recording:
     """Read a whole recording. If its recorder was killed, read up to the last whole chunk.
 
+    `time_ns` of its scans and marks is 0: `messages` finds it, `force.tables.load_forces`, a replay.
+
     :raises RecordingError: one line that names the file and what is wrong with it.
     """
     in_order = list(messages(path))
