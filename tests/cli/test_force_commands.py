@@ -78,6 +78,23 @@ def test_stream_tares(run: Run, skin: Path) -> None:
     assert load_calibration(skin).tare is None
 
 
+def test_a_picture_of_a_focus_knows_the_scans_before_it(tmp_path: Path, run: Run) -> None:
+    """A picture a second, of several hundred scans: each was to be told apart from the one before,
+    by a region that was chosen a second ago. Forces came out wrong, and were called certain."""
+    of_scene("moving").save(tmp_path / "skin.json")
+    url = "emulator://8x8?scene=moving&seed=1&begin=0&speed=0"
+    words = ("--calibration", str(tmp_path / "skin.json"), "--focus", "--seconds", "6")
+    said = well(run("stream", url, *words)).out
+    assert "no resistances" not in said
+    found = re.findall(
+        r"contact (\d+): .* at \(([\d.]+), ([\d.]+)\)\ntruth: .* at \((.*), (.*)\)", said
+    )
+    assert len(found) > 4
+    numbers = np.array(found, dtype=float)
+    assert set(numbers[:, 0]) == {1.0}
+    np.testing.assert_allclose(numbers[:, 1:3], numbers[:, 3:], atol=0.25)
+
+
 def test_stream_without_a_calibration_can_be_told_rest(run: Run) -> None:
     stds = []
     for rest in ((), ("--tare", "0.2")):

@@ -27,7 +27,7 @@ from ohmskin.estimate.knowledge import REF_LOG_STD
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.contacts import found
-from ohmskin.force.reader import SkinReader
+from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
 
@@ -140,9 +140,15 @@ def _print_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan])
 def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) -> None:
     drawn_s = float("-inf")  # a skin in stepped time begins at 0
     live = Live(console=_out, auto_refresh=False) if _out.is_terminal else None
+    reads_all = reader is not None and reader.focus is not None
     with live or nullcontext():
         for scan in scans:
-            if scan.host_time_s - drawn_s >= (DISPLAY_EVERY_S if live else _PRINT_EVERY_S):
+            is_due = scan.host_time_s - drawn_s >= (DISPLAY_EVERY_S if live else _PRINT_EVERY_S)
+            # What a region shows depends on the scans before it, most of all on whole ones.
+            reads_all = reads_all or not scan.is_whole
+            if reader is not None and (is_due or reads_all):
+                scan = reader.read(scan)
+            if is_due:
                 drawn_s = scan.host_time_s
                 picture = _picture(skin, reader, scan)
                 if live:
@@ -151,18 +157,18 @@ def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) 
                     WIDE.print(picture)
 
 
-def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
+def _picture(skin: Device, reader: SkinReader | None, shown: Scan) -> Group:
+    """A scan for people. shown: as the reader has read it, if there is one."""
     stats = skin.stats
     caption = (
-        f"scan {scan.number}  {skin.info.rate_hz:.1f} Hz  missed {stats.missed}  "
+        f"scan {shown.number}  {skin.info.rate_hz:.1f} Hz  missed {stats.missed}  "
         f"damaged {stats.line.damaged}  restarts {stats.restarts}"
     )
-    if reader is None:
+    if reader is None or not isinstance(shown, ForceScan):
         title = f"{skin.name}: reading B in thousandths of Vdd"
-        level = 1e3 * scan.ratio[:, :, scan.reading_names.index("b")]
+        level = 1e3 * shown.ratio[:, :, shown.reading_names.index("b")]
         # Small readings are about as large, in these units, as conductances are in microsiemens.
         return Group(Text(title), coloured(level, FULL_SCALE_USIEMENS), Text(caption))
-    shown = reader.read(scan)
     if not shown.estimate.converged:
         caption += f"  not converged: {shown.estimate.message}"
     if shown.estimate.wires == ASSUMED:
@@ -178,7 +184,7 @@ def _picture(skin: Device, reader: SkinReader | None, scan: Scan) -> Group:
         )
         lines = ["   ".join(contacts) or "no contact"]
         if skin.true_force_n is not None:
-            true_n = skin.true_force_n(scan)[None]  # of one scan
+            true_n = skin.true_force_n(shown)[None]  # of one scan
             (truth,) = found(true_n > KNOWN_N, true_n, np.zeros_like(true_n))
             of_each = (f"{one.force_n:.2f} N at ({one.row:.1f}, {one.column:.1f})" for one in truth)
             lines.append(f"truth: {'   '.join(of_each) or 'no contact'}")

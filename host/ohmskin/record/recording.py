@@ -233,7 +233,7 @@ class Recording:
 def load_recording(path: PathName) -> Recording:
     """Read a whole recording. If its recorder was killed, read up to the last whole chunk.
 
-    `time_ns` of its scans and marks is 0: `messages` finds it, `force.tables.load_forces`, a replay.
+    `time_ns` of its scans and marks is 0: `messages`, `load_forces` and a replay find it.
 
     :raises RecordingError: one line that names the file and what is wrong with it.
     """
