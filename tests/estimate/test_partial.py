@@ -10,6 +10,7 @@ import pytest
 
 from network import SkinCircuit, floating_share
 from ohmskin.arrays import Float
+from ohmskin.estimate.joint import BEYOND_REGION
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import METHODS, make_estimator
 from ohmskin.estimate.port_currents import MOST_OFFSET_RATIO
@@ -302,6 +303,43 @@ def test_cells_outside_a_region_age_however_touches_in_it_change(
     outside = (found.cell_siemens_std / found.cell_siemens)[6:, :3]
     assert (outside > 0.9 * 12 * STALE_SHARE).all()
     assert (outside < 1.1 * 12 * STALE_SHARE).all()
+
+
+@pytest.mark.parametrize("read", ["half", "quick"])
+@pytest.mark.parametrize("method", ["joint", "touch"])
+def test_where_a_region_does_not_explain_what_it_reads_the_other_cells_stay(
+    method: str, read: str
+) -> None:
+    """A finger goes round the skin, and only the cells in the middle are read. Cells elsewhere were
+    called untouched, and certain, because the prior alone was left to speak of them."""
+    _, rest, frames = trial("finger")
+    estimator = make_estimator(method, knowledge(rest))
+    before, middle = estimator.estimate(frames[0]), slice(2, 6)
+    outside = np.ones((8, 8), dtype=bool)
+    outside[middle, middle] = False
+    messages = set()
+    for frame in frames[1:]:
+        found = estimator.estimate(of_region(frame, middle, middle, READ[read]))
+        messages.add(found.message)
+        for name in ("cell_siemens", "cell_siemens_std"):
+            ratio = (getattr(found, name) / getattr(before, name))[outside]
+            assert (ratio > 0.999).all()
+            assert (ratio < 1.001).all() or name == "cell_siemens_std"
+        before = found
+    assert messages == {"", BEYOND_REGION}
+
+
+def test_cells_that_have_left_a_region_stay_as_it_has_read_them() -> None:
+    """They became again what the last whole frame had shown."""
+    known, soft = read_with(2e-5, 3, 5)
+    hard = read_with(1e-4, 3, 5)[1]
+    estimator = make_estimator("joint", known)
+    estimator.estimate(soft)
+    for _ in range(5):
+        near = estimator.estimate(of_region(hard, slice(2, 5), slice(4, 7), READ["near"]))
+    away = estimator.estimate(of_region(hard, slice(5, 8), slice(0, 3), READ["near"]))
+    assert away.cell_siemens[3, 5] == pytest.approx(near.cell_siemens[3, 5])
+    assert away.cell_siemens_std[3, 5] > near.cell_siemens_std[3, 5]
 
 
 def test_what_a_whole_frame_cannot_be_relied_on_for_no_region_is() -> None:

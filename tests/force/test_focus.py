@@ -90,6 +90,9 @@ def test_a_contact_that_is_new_in_a_region_is_looked_at_by_a_whole_scan() -> Non
         assert asked[-1].rows == rows
     focus.follow(touched((2, 4), (6, 4)), 1, some)
     assert asked[-1].rows == range(1, 8)
+    # What it reads cannot come from the region alone.
+    focus.follow(touched((2, 4), (6, 4)), 1, some, is_doubted=True)
+    assert asked[-1].rows is None
 
 
 @pytest.mark.parametrize("settle_us", [0, 20])

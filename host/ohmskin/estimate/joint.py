@@ -43,7 +43,7 @@ from ohmskin.estimate.prior import (
     siemens_std,
 )
 from ohmskin.estimate.region_fit import Answer, RegionFit, WholeFrame
-from ohmskin.estimate.sparse_fit import FewTouches, SparseFit, Touched, most_touches
+from ohmskin.estimate.sparse_fit import Cells, FewTouches, SparseFit, Touched, most_touches
 from ohmskin.estimate.staying_faults import StayingFaults
 from ohmskin.estimate.wire_belief import MOST_FITS, WireBelief
 
@@ -60,6 +60,8 @@ PALM_TIMES: Final = 10.0
 # wire must not be neglected, and it may hide touches behind it. Chosen: 8 segments of 3 kOhm. From
 # there on, a fit that starts at rest takes fewer steps.
 LONG_LINE_OHM: Final = 24e3
+# Why such a frame is no answer.
+BEYOND_REGION: Final = "something has changed outside of the region: read the whole skin"
 
 
 class JointEstimator(Estimator):
@@ -157,16 +159,18 @@ class JointEstimator(Estimator):
     def _fitted(self, ports: PortReadings, *, again: bool) -> tuple[Solution, bool]:
         """One fit of a frame, and whether the frame has to be fitted again.
 
-        A frame of a region is fitted by `RegionFit` if this explains it; nothing is learned from
-        it. Else the fit is that of a few touches where these are the answer, as they may be for
-        `touch`. Else it is the fit of all resistances.
+        A frame of a region is fitted by `RegionFit` if this explains it, or by `_beyond_region`;
+        nothing is learned from it. Another frame is fitted by a few touches where these are the
+        answer, as they may be for `touch`. Else it is the fit of all resistances.
 
         again: the frame has been fitted before. What this fit teaches takes the place of what the
             last one has taught.
         """
         prior = self._at_rest.of_frame(ports)
-        if ports.region is not None and (part := self._of_region(prior, ports)):
-            return self._solution(ports, part, self._whole_message), False
+        if ports.region is not None and self._whole is not None:
+            if part := self._of_region(prior, ports, self._whole):
+                return self._solution(ports, part, self._whole_message), False
+            return self._solution(ports, self._beyond_region(prior, ports), BEYOND_REGION), False
         touches = self._few_touches(prior, ports)
         if touches is not None and (touched := self._explained_by(prior, touches)):
             return self._of_few(ports, touched, again=again)
@@ -255,24 +259,43 @@ class JointEstimator(Estimator):
             self._finder = SparseFit(prior, self._belief, self.knowledge.ref_ohm)
         return self._finder.find(ports)
 
-    def _of_region(self, prior: CellPrior, ports: PortReadings) -> RegionFit | None:
+    def _of_region(
+        self, prior: CellPrior, ports: PortReadings, whole: Answer | WholeFrame
+    ) -> RegionFit | None:
         """A fit of the cells that were read; the others stay as in the last whole frame.
 
-        None: there is no whole frame yet, or this fit does not explain the readings.
+        None: this fit does not explain the readings.
         """
         assert ports.region is not None
-        if self._whole is None:
-            return None
-        if not isinstance(self._whole, WholeFrame):
-            self._whole, self._region = self._as_whole(prior, self._whole), None
-        if self._region is None or not np.array_equal(self._region.region, ports.region):
-            self._region = RegionFit(self._whole, ports.region)
+        if not isinstance(whole, WholeFrame):
+            self._whole = whole = self._as_whole(prior, whole)
+            self._region = RegionFit(whole, ports.region)
+        assert self._region is not None
+        if not np.array_equal(self._region.region, ports.region):
+            self._move_region(prior, ports.region)
         explains = self._region.fit(ports)
         if explains and self._region.has_left():
-            self._whole = self._as_whole(prior, self._region)
-            self._region = RegionFit(self._whole, ports.region, self._region.age - 1)
+            self._region.age -= 1
+            self._move_region(prior, ports.region)
             explains = self._region.fit(ports)
         return self._region if explains else None
+
+    def _move_region(self, prior: CellPrior, region: Cells) -> None:
+        """Go on with this region, about the cells as the last region has left them."""
+        assert self._region is not None
+        self._whole = whole = self._as_whole(prior, self._region)
+        self._region = RegionFit(whole, region, self._region.age)
+
+    def _beyond_region(self, prior: CellPrior, ports: PortReadings) -> FullFit:
+        """The fit of a frame that its region does not explain: something outside has changed.
+
+        A port that was not read says less and less of its cells, and the prior says that they are
+        at rest. So they stay as they were, but no better known than what this fit makes of them.
+        """
+        assert self._region is not None
+        fit, _ = self._fit_all(prior, ports, self._start(prior, ports, None), is_palm=False)
+        self._region.keep_others(fit)
+        return fit
 
     def _as_whole(self, prior: CellPrior, answer: Answer) -> WholeFrame:
         """This answer, as what regions of later frames are fitted about."""

@@ -61,23 +61,21 @@ class RegionFit:
     modelled: port currents of the model, (RC,) [S]; outside of the region, those that are kept.
     iterations: steps of the last frame.
     misfit, surprise: of the whole frame, because a frame that does not fit gets no answer here.
-    age: for how many frames the cells outside have not been read.
+    age: for how many frames the cells outside have not been read, this one included.
     fitted_std, fitted_own_std: log_cells_std and own_log_std without what cells outside may have
         changed by since, (RC,).
     """
 
-    log_cells: Float
-    log_cells_std: Float
-    own_log_std: Float
-    by_means: Float
-    fitted_std: Float
-    fitted_own_std: Float
-    misfit: float
-    surprise: float
-
     def __init__(self, whole: WholeFrame, region: Cells, age: int = 0) -> None:
         self.region, self._whole, net = region, whole, whole.net
-        self.misfit, self.surprise = whole.misfit, whole.surprise
+        self.misfit: float = whole.misfit
+        self.surprise: float = whole.surprise
+        self.log_cells: Float = whole.log_cells
+        self.by_means: Float = whole.by_means
+        self.fitted_std: Float = whole.log_cells_std
+        self.fitted_own_std: Float = whole.own_log_std
+        self.log_cells_std: Float = self.fitted_std
+        self.own_log_std: Float = self.fitted_own_std
         self._x = -whole.log_cells[region]
         self._before = net.cell_siemens[region]
         self._port_volt = net.port_volt[region[:, None], region]
@@ -99,6 +97,7 @@ class RegionFit:
         Only then are all attributes those of this frame.
         """
         region, whole, x = self.region, self._whole, self._x
+        self.age += 1
         measured = ports.current.ravel()[region]
         reading_variance = ports.current_std.ravel()[region] ** 2
         system = self._model_covariance.copy(order="F")
@@ -142,7 +141,6 @@ class RegionFit:
     def _answer(self, covariance: Float, by_means: Float) -> None:
         """Logs of all cells, from the covariance of those of the region, (k, k) and (k, means)."""
         whole, region = self._whole, self.region
-        self.age += 1
         self.log_cells = whole.log_cells.copy()
         self.log_cells[region] = -self._x
         self.fitted_std = whole.log_cells_std.copy()
@@ -155,6 +153,20 @@ class RegionFit:
         self.fitted_own_std[region], self.by_means[region] = of_region
         self.own_log_std = np.hypot(self.fitted_own_std, STALE_SHARE * self.age)
         self.own_log_std[region] = self.fitted_own_std[region]
+
+    def keep_others(self, fit: FullFit) -> None:
+        """Let cells outside of the region stay, in the fit of a whole frame, as they were.
+
+        The fit may move them: by that much, too, they are uncertain then.
+        """
+        whole, others = self._whole, np.ones(fit.log_cells.size, dtype=bool)
+        others[self.region] = False
+        moved = np.abs(fit.log_cells - whole.log_cells)[others]
+        stale = np.hypot(moved, STALE_SHARE * self.age)
+        for name in ("log_cells_std", "own_log_std"):
+            std, before = getattr(fit, name), np.hypot(getattr(whole, name)[others], stale)
+            std[others] = np.maximum(std[others], before)
+        fit.log_cells = np.where(others, whole.log_cells, fit.log_cells)
 
     def has_left(self) -> bool:
         """Whether the fitted cells have moved too far from g0 for S."""

@@ -4,8 +4,9 @@
 A region of a few lines is read several times as often as the whole skin. It does not show a touch
 that is elsewhere, so whole scans come in between, `WHOLE_HZ` times a second. And a new touch in a
 region may be the ghost of touches outside. So may a touch that seems to grow along rows and columns
-at once, as three touches outside let it, at the other corners of a rectangle. In both cases, the
-next scan is a whole one.
+at once, as three touches outside let it, at the other corners of a rectangle. And where no touches
+in the region explain what it reads, something has changed outside. In all these cases, the next
+scan is a whole one.
 """
 
 import threading
@@ -82,8 +83,12 @@ class Focus(Closing):
         self._cell_s = self._whole_s = 0.0
         self._ask(None)
 
-    def follow(self, touched: Bool, contact_count: int, scan: Scan) -> None:
+    def follow(
+        self, touched: Bool, contact_count: int, scan: Scan, *, is_doubted: bool = False
+    ) -> None:
         """Tell what a scan has shown: touched cells (R, C), and so many contacts.
+
+        is_doubted: its region does not explain what it reads.
 
         If another region is needed, this gives a command to the board. It takes some milliseconds,
         in which scans wait.
@@ -93,7 +98,7 @@ class Focus(Closing):
         """
         is_new, self._contact_count = contact_count > self._contact_count, contact_count
         lines = wanted_lines(touched, self._lines)
-        if not scan.is_whole and (is_new or _has_grown(lines, self._lines)):
+        if not scan.is_whole and (is_doubted or is_new or _has_grown(lines, self._lines)):
             lines = None
         with self._lock:
             if lines != self._lines and not self._closed:

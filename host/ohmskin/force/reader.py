@@ -370,7 +370,8 @@ class SkinReader:
             if geometry is not None:
                 contacts = tuple(geometry.placed(contact, force_n) for contact in contacts)
             if (focus := self.focus) is not None:  # another thread may end it
-                focus.follow(estimate.touched, len(contacts), scan)
+                doubted = not estimate.converged
+                focus.follow(estimate.touched, len(contacts), scan, is_doubted=doubted)
             forces_n = {"force_n": force_n, "force_n_std": force_n_std}
             others = {"contacts": contacts, "estimate": estimate, "geometry": geometry}
             shown.append(ForceScan(**vars(scan) | forces_n | others))
