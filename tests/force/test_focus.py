@@ -182,6 +182,11 @@ def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:
     for like in (Region(mode="far"), Region(whole_mode="far"), Region(mode="bad")):
         with pytest.raises(ValueError, match=r"mode near, half or quick, not (far|bad)"):
             Focus(stepped("emulator://8x8"), like)  # it was refused when the first touch came
+    for like in (Region(rows=[1]), Region(columns=range(4)), Region(whole_every=20)):
+        with pytest.raises(ValueError, match="follow the contacts: leave them out"):
+            Focus(stepped("emulator://8x8"), like)  # they were overwritten in silence
+    with pytest.raises(TypeError, match=r"focus is True, False or an .*, not 'quick'"):
+        ohmskin.open("emulator://8x8", calibration=of_scene("rest"), focus="quick")
     board = stepped("emulator://4x4")
     with Recorder(tmp_path / "a.mcap", board.info, lambda: board.now_s) as recorder:
         record(board, recorder, scans_for(board, 0.1))

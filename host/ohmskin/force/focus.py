@@ -74,6 +74,8 @@ class Focus(Closing):
         self._contact_count = 0
         self._lock, self._closed = threading.Lock(), False
         self._before = Region.of(device.info)
+        if (like.rows, like.columns, like.whole_every) != (None, None, 0):
+            raise ValueError("rows, columns and whole_every follow the contacts: leave them out")
         if device.info.reads_far:
             raise ValueError("only near ends can be followed: 'ohmskin configure PORT --mode near'")
         for mode in (like.mode, like.whole_mode):

@@ -446,6 +446,8 @@ class CalibratedSkin(Closing):
         """See `Device.name`."""
         self._reader = SkinReader(device.info, calibration, force=force)
         self._focus: Focus | None = None
+        if not isinstance(focus, bool | Region):
+            raise TypeError(f"focus is True, False or an ohmskin.Region, not {focus!r}")
         if focus:
             self._focus = self._reader.focus_on(device, FOLLOWING if focus is True else focus)
         device.only_unit = device.info.unit_id
