@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where reading goes after each scan."""
 
+import time
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -174,6 +175,21 @@ def test_the_port_is_given_back_whatever_the_skin_has_become() -> None:
         skin.device.configure(rows=4)
     with pytest.raises(DeviceLost, match="was closed"):
         skin.latest()
+
+
+def test_a_slow_program_gets_regions_that_are_new() -> None:
+    """It got every scan, of contacts that were there seconds ago, until its queue was full."""
+    url, like = "emulator://8x8?scene=single&begin=0", Region(settle_us=20)
+    with ohmskin.open(url, calibration=of_scene("single"), focus=like) as skin:
+        begin_s, missed = skin.device.now_s, 0
+        for scan in skin:
+            missed += scan.missed
+            if (now_s := skin.device.now_s) > begin_s + 2.0:
+                break
+            time.sleep(0.01)
+        assert now_s - scan.host_time_s < 0.8
+        assert missed > 300
+        assert skin.stats.missed == 0
 
 
 def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:

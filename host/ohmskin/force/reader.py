@@ -44,6 +44,8 @@ DEFAULT_METHOD: Final = "joint"
 # A tare is the mean of the scans of so many seconds [s], unless told. Chosen: the mean of 90 scans
 # has a tenth of the noise of one scan, and nobody has to wait for long.
 TARE_S: Final = 1.0
+# How long a scan of a region waits for a slow machine [s]. Chosen: a whole scan comes twice in it.
+LATE_S: Final = 0.1
 # A cell that conducts less than this share of what it did at rest counts as open. Chosen: rests
 # drift by a third, and an open line leaves a thousandth.
 _OPEN_SHARE: Final = 0.1
@@ -491,14 +493,25 @@ class CalibratedSkin(Closing):
         self.device.start()
 
     def __iter__(self) -> Iterator[ForceScan]:
-        """Every scan from now on, with its forces."""
+        """Every scan from now on, with its forces.
+
+        With `focus`, scans of regions that have waited for `LATE_S` are passed over, and counted in
+        `missed` of the next one: a region must not follow contacts of long ago.
+        """
         reader = self.new_reader()
         reader.focus = self._focus
         return self._read_by(reader, iter(self.device))
 
     def _read_by(self, reader: SkinReader, scans: Iterator[Scan]) -> Iterator[ForceScan]:
+        passed = 0
         try:
-            yield from map(reader.read, scans)
+            for scan in scans:
+                late_s = 0.0 if self.device.waits else self.device.now_s - scan.host_time_s
+                if self._focus is not None and not scan.is_whole and late_s > LATE_S:
+                    passed += 1 + scan.missed
+                    continue
+                yield reader.read(replace(scan, missed=scan.missed + passed) if passed else scan)
+                passed = 0
         finally:
             if self._focus is not None:
                 self._focus.rest()
