@@ -17,7 +17,7 @@ from ohmskin.estimate.port_currents import MOST_OFFSET_RATIO
 from ohmskin.estimate.port_partial import STALE_SHARE
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.link.codes import quantise, ratio_from_codes
-from ohmskin.record.readings import estimate_file, load_readings
+from ohmskin.record.readings import Readings, estimate_file, load_readings
 from studies.judge import STATED_STDS, answers_of, judge, pooled
 from studies.trials import Trial, finger_trial, random_trial, skin_at_rest
 
@@ -218,6 +218,14 @@ def test_methods_that_need_all_readings_say_so(method: str) -> None:
     estimator = make_estimator(method, SkinKnowledge(2, 2))
     with pytest.raises(ValueError, match=f"'{method}' takes whole scans of a b c d: use 'joint'"):
         estimator.estimate(ratio)
+
+
+def test_a_file_is_refused_before_the_first_frame_takes_minutes() -> None:
+    _, rest, frames = trial("touches")
+    every = slice(None)
+    ratio = np.stack([frames[0], of_region(frames[1], every, every, READ["half"])])
+    with pytest.raises(ValueError, match="'lsq' takes whole scans"):
+        estimate_file(Readings(ratio, rest), "lsq", watch=lambda _: pytest.fail("estimated"))
 
 
 def test_a_frame_may_have_fewer_readings_than_the_skin() -> None:

@@ -192,6 +192,12 @@ class Estimator(ABC):
             raise ValueError("the readings of the untouched skin are not known")
         return self._level(self.knowledge.rest_ratio, rest)[0]
 
+    @classmethod
+    def check_takes(cls, ratio: Float) -> None:
+        """Raise ValueError if readings of which some are NaN are none for this method."""
+        if not cls.takes_partial and np.isnan(ratio).any():
+            raise ValueError(f"'{cls.name}' takes whole scans of a b c d: use 'joint' or 'touch'")
+
     def estimate(self, ratio: ArrayLike, reading_names: Sequence[str] = ()) -> Estimate:
         """Estimate the cells from one frame of readings (R, C, 4), each V/Vdd in 0..1.
 
@@ -222,8 +228,7 @@ class Estimator(ABC):
         if names != knowledge.reading_names and not is_near({*names, *knowledge.reading_names}):
             raise ValueError(f"these readings are {names}, this skin's {knowledge.reading_names}")
         readings = check_ratio(ratio, *shape, of=names)
-        if not self.takes_partial and np.isnan(readings).any():
-            raise ValueError(f"'{self.name}' takes whole scans of a b c d: use 'joint' or 'touch'")
+        self.check_takes(readings)
         self.rest()
         started = time.perf_counter()
         with one_blas_thread:

@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Float
 from ohmskin.circuit.configurations import DEFAULT_REF_OHM, NEAR
 from ohmskin.estimate.knowledge import WIRE_FIELDS, SkinKnowledge, WireOhm, check_ratio
-from ohmskin.estimate.methods import make_estimator
+from ohmskin.estimate.methods import kind_of, make_estimator
 from ohmskin.files import PathName, naming, require_file, whole_file
 from ohmskin.link.protocol import ENUMS
 
@@ -270,9 +270,11 @@ def estimate_file(
 
     Each frame starts from the one before, unless `cold`, or unless rest or wires are given per
     frame: then each frame is a skin of its own. watch: a progress bar that passes the frames on.
-    Raises ValueError for an unknown method.
+    Raises ValueError for an unknown method, or one that does not take what the frames have.
     """
     out: dict[str, NDArray[Any]] = {}
+    for ratio in readings.ratio:  # before the first frame, which may take minutes
+        kind_of(method).check_takes(ratio)
     for frame, ratio in enumerate(watch(readings.ratio)):
         if not frame or readings.one_skin_per_frame:
             estimator = make_estimator(method, readings.knowledge(frame))
