@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ohmskin
+from calibrations import of_scene
 from command_line import Done, Run, assert_one_line, well
 from ohmskin.arrays import Float
 from ohmskin.cli.board import TERMINAL
@@ -288,6 +289,22 @@ def test_a_table_makes_a_calibration(run: Run, tmp_path: Path) -> None:
     np.testing.assert_allclose(found.rest.level, rest, rtol=0.1)
     with ohmskin.open(REST, calibration=out) as skin:
         assert np.abs(skin.latest().force_n).max() < 0.02
+
+
+def test_a_new_calibration_keeps_where_the_cells_are(run: Run, tmp_path: Path) -> None:
+    """It dropped the geometry of the file it replaces, without a word."""
+    table, out = tmp_path / "presses.csv", tmp_path / "skin.json"
+    press_table(table)
+    words = ("calibrate", "table", REST, str(table), str(out), "--rest", "0.05", *TOLD)
+    out.write_text("no calibration")
+    assert "stay" not in well(run(*words)).out
+    well(run("skin", str(out), "--pitch-mm", "10,20", "--frame", "arm"))
+    assert f"cells stay where {out} had them: flat, in 'arm'" in well(run(*words)).out
+    assert load_calibration(out).geometry.position_m[1, 2] == pytest.approx([0.02, 0.02, 0])
+    of_scene("rest").save(out)  # of 8x8 cells
+    well(run("skin", str(out), "--pitch-mm", "10,20"))
+    assert "stay" not in well(run(*words)).out
+    assert load_calibration(out).geometry is None
 
 
 def test_bad_tables(run: Run, tmp_path: Path) -> None:

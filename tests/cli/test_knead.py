@@ -58,8 +58,10 @@ def test_a_skin_is_kneaded_until_every_cell_is_known(run: Run, tmp_path: Path) -
     assert load_calibration(out).indenter_area_m2 is None
     force_n, true_n = streamed(run, "emulator://2x3?scene=ghost&begin=0&speed=0", out)
     np.testing.assert_allclose(force_n[true_n > 0], true_n[true_n > 0], rtol=0.3)
-    # Once more: all is known, and nothing is recorded.
+    # Once more: all is known, and nothing is recorded. Where cells are stays in the file.
+    well(run("skin", str(out), "--pitch-mm", "10,10"))
     again = well(run("calibrate", "knead", f"{SKIN}&scene=knead", str(out), *TRUTH))
+    assert f"cells stay where {out} had them: flat" in again.out
     assert "touch nothing" not in again.out
     assert not (tmp_path / "skin.knead-2.mcap").exists()
     # Where that has failed to teach a calibration, more is recorded; an older one may be there.

@@ -5,6 +5,7 @@ import json
 import math
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
@@ -42,7 +43,7 @@ from ohmskin.errors import TareRefused
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import LEVEL_METHODS, VOLTAGE
 from ohmskin.files import check_place, naming
-from ohmskin.force.calibration import Calibration
+from ohmskin.force.calibration import Calibration, load_calibration
 from ohmskin.force.reader import DEFAULT_METHOD, TARE_S
 from ohmskin.link.device import Device, mean_ratio, scans_for
 from ohmskin.link.messages import Hello
@@ -333,8 +334,7 @@ def _knead(
         log = replace(log, time_s=log.time_s + offset_s + late_s, any_zero=True)
     fit = kneading.learn(log, progress("scans"), lags=lags)
     lag_s = fit.scale_.lag_s - late_s
-    calibration = calibrator.calibration_of(fit.model(), fit.largest_n)
-    calibration.save(out)
+    calibration = _saved(calibrator.calibration_of(fit.model(), fit.largest_n), out)
     stds, left_out = fit.gain_std(), []
     for begin_s, end_s in fit.left_out:
         number, first_s = kneading.recording_at(begin_s)
@@ -470,7 +470,7 @@ def _finish(
     """
     with naming(source):
         calibration, message = calibrator.calibration(presses)
-    calibration.save(out)
+    calibration = _saved(calibration, out)
     model = calibration.model
     if note:
         TERMINAL.print(note)
@@ -491,9 +491,22 @@ def _finish(
     _conclude(calibration, calibrator, out)
 
 
+def _saved(calibration: Calibration, out: Path) -> Calibration:
+    """Write the calibration, with the geometry of the one it replaces, if that is as large."""
+    if out.is_file():
+        with suppress(ValueError):  # what cannot be read is replaced
+            before = load_calibration(out)
+            if (before.rows, before.columns) == (calibration.rows, calibration.columns):
+                calibration = replace(calibration, geometry=before.geometry)
+    calibration.save(out)
+    return calibration
+
+
 def _conclude(calibration: Calibration, calibrator: Calibrator, out: Path) -> None:
     """Say what was written. The largest force shows it if a sensor's newtons are none."""
     TERMINAL.print(_wires_in_words(calibration, calibrator))
+    if (kept := calibration.geometry) is not None:
+        TERMINAL.print(f"cells stay where {out} had them: {kept.kind}, in '{kept.frame_id}'")
     of = f"{out}: calibration of unit {calibration.unit_id}"
     TERMINAL.print(f"{of}, by presses up to {calibration.largest_force_n:.3g} N")
 
