@@ -73,7 +73,8 @@ def test_it_is_kept(tmp_path: Path) -> None:
         ({**FLAT, "radius_m": 1}, "unknown field 'geometry.radius_m'"),
         ({**FLAT, "pitch_m": [0.01]}, "pitch_m has not the shape"),
         ({**FLAT, "pitch_m": [0.01, "x"]}, "pitch_m holds str"),
-        ({**FLAT, "pitch_m": [0.01, 1e9]}, "beyond 100"),
+        ({**FLAT, "pitch_m": [0.01, 1e9]}, "beyond 100: is it in metres"),
+        ({**FLAT, "pitch_m": [10, 10]}, "cells lie 70 m apart: are these millimetres"),
         ({**FLAT, "pitch_m": [0.01, 0]}, "pitch_m holds 0: cells are 0.0001 or more apart"),
         ({**FLAT, "frame_id": "a\x1b[2J"}, "frame_id must be a name"),
         ({**CYLINDER, "radius_m": 0}, "radius_m is 0, it must be 0.0001 or more"),
@@ -164,10 +165,12 @@ def test_icub_s_files_are_read(tmp_path: Path) -> None:
     ("arrays", "reason"),
     [
         ('<array rows="12" cols="12" size="1 1"/>', "an <array> of 12x12 taxels, the skin has 2x3"),
-        ('<array rows="2" cols="3" size="1 1" order="col-major"/>', "not one <array>, row-major"),
+        ('<array size="1 1" order="col-major"/>', "order='col-major' of its <array>: only row-maj"),
         ('<array rows="2" cols="3" size="1 1" offset="1"/>', "offset='1' is not 2 numbers"),
         ('<array rows="2" cols="3"/>', "size='' is not 2 numbers"),
-        ('<array size="1 1"/><array size="2 2"/>', "not one <array>, row-major"),
+        ('<array size="1 1"/><array size="2 2"/>', "2 <array>s: leave only this skin's"),
+        ('<array size="0 0"/>', r"6 cells are at one place, \[0.0, 0.0, 0.0\] m"),
+        ('<array size="1 x"/>', "size='1 x' is not 2 numbers"),
     ],
 )
 def test_an_array_that_is_not_this_skin_s_is_refused(
@@ -205,7 +208,7 @@ def test_a_urdf_array_has_x_along_rows(tmp_path: Path) -> None:
     assert known.position_m[1, 2] == pytest.approx([0.019, 0.062, 0])
 
 
-@pytest.mark.parametrize("taxels", ['<taxel idx="0"/><taxel idx="1"/>', '<array size="1 1"/>'])
+@pytest.mark.parametrize("taxels", ['<taxel/><taxel xyz="1 0 0"/>', '<array size="1 1"/>'])
 def test_taxels_of_two_sensors_are_refused(tmp_path: Path, taxels: str) -> None:
     """They were taken for those of one skin, in turn."""
     path = tmp_path / "robot.urdf"
@@ -215,6 +218,20 @@ def test_taxels_of_two_sensors_are_refused(tmp_path: Path, taxels: str) -> None:
         Geometry.of_file(path, 2, 2, "skin")
     path.write_text(f"<robot><sensor><camera/></sensor>{sensor}</robot>")
     assert Geometry.of_file(path, 1, 2, "skin").kind == "table"
+
+
+@pytest.mark.parametrize(
+    ("lines", "reason"),
+    [
+        ("0 0 0 0 0 1\n10 0 0 0 0 1", "cells lie 10 m apart: are these millimetres"),
+        ("0 .5 0 0 0 1\n0 0.5 0 1 0 0", r"2 cells are at one place, \[0.0, 0.5, 0.0\] m"),
+    ],
+)
+def test_taxels_of_no_skin_are_refused(tmp_path: Path, lines: str, reason: str) -> None:
+    """Places in millimetres, and all taxels in one place, were taken."""
+    (path := tmp_path / "taxels.txt").write_text(lines)
+    with pytest.raises(ValueError, match=reason):
+        Geometry.of_file(path, 1, 2, "skin")
 
 
 @pytest.mark.filterwarnings("error")
@@ -227,7 +244,11 @@ def test_taxels_of_two_sensors_are_refused(tmp_path: Path, taxels: str) -> None:
         ('<robot><taxel rpy="0 inf 0"/></robot>', "is not 3 numbers"),
         ("nothing", "0 taxels"),
         pytest.param("1" * 500 + "x", "0 taxels", id="a long number"),
-        ("1 2 3 4 5 6e", "could not convert"),
+        ("1 2 3 4 5 6e", "'1 2 3 4 5 6e' is not 6 numbers"),
+        ("1 2 3 E.. 5 1e999", "'1 2 3 E.. 5 1e999' is not 6 numbers"),
+        ('<robot><taxel idx="a0"/></robot>', "idx='a0' is no whole number"),
+        ('<robot><taxel idx="-1"/></robot>', "idx='-1' is no whole number"),
+        ('<robot><taxel idx="1"/><taxel idx="01"/></robot>', "two taxels have idx='1'"),
     ],
 )
 def test_files_of_taxels_that_say_none(tmp_path: Path, text: str, reason: str) -> None:

@@ -20,6 +20,7 @@ In the calibration file, `Geometry.told` says where the cells are, by kind:
 """
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Final, Self
 from xml.etree import ElementTree
@@ -39,6 +40,9 @@ KINDS: Final = {
 # No cell is farther from the origin of its frame [m], and no pitch or radius is larger. Chosen:
 # robots are smaller.
 _FARTHEST_M: Final = 100.0
+# No skin is longer along any axis [m]. Chosen: it covers a robot's arm, and one whose places are in
+# millimetres is longer.
+_LONGEST_M: Final = 3.0
 # No cylinder is thinner, and no pitch is less [m]. Chosen: no textile bends round less.
 _LEAST_M: Final = 1e-4
 # A frame's name has at most so many characters. Chosen: names of links in URDF files are shorter.
@@ -77,11 +81,17 @@ class Geometry:
             raise ValueError(f"frame_id must be a name of 1 to {_LONGEST_NAME} characters")
         for name, numbers in self.told.items():
             if not (np.abs(numbers) <= _FARTHEST_M).all():  # so that NaN fails too
-                raise ValueError(f"{name} holds a number beyond {_FARTHEST_M:g}")
+                raise ValueError(f"{name} holds a number beyond {_FARTHEST_M:g}: is it in metres?")
         position_m, normal = self._cells()
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         if not (length > 0).all():
             raise ValueError("normal has the length 0")
+        all_m = position_m.reshape(-1, 3)
+        if (long_m := np.ptp(all_m, axis=0).max()) > _LONGEST_M:
+            raise ValueError(f"cells lie {long_m:g} m apart: are these millimetres, not metres?")
+        places, counts = np.unique(all_m, axis=0, return_counts=True)
+        if (most := counts.max()) > 1:
+            raise ValueError(f"{most} cells are at one place, {places[counts.argmax()].tolist()} m")
         object.__setattr__(self, "position_m", position_m)
         object.__setattr__(self, "normal", normal / length)
 
@@ -152,10 +162,19 @@ def required(geometry: Geometry | None) -> Geometry:
     return geometry
 
 
+def _numbers(text: str, count: int, of: str) -> Float:
+    """So many numbers. Raises ValueError, which says what the text is of, if it is no such text."""
+    with suppress(ValueError):
+        found = np.array(text.split(), dtype=np.float64)
+        if found.size == count and np.isfinite(found).all():
+            return found
+    raise ValueError(f"{of}'{text[:40]}' is not {count} numbers")
+
+
 def _of_lines(text: str) -> Float:
     """Position and normal of each taxel, (n, 6)."""
-    lines = [line.split() for line in text.splitlines() if re.fullmatch(_SIX_NUMBERS, line)]
-    return np.array(lines, dtype=np.float64).reshape(-1, 6)
+    lines = [line for line in text.splitlines() if re.fullmatch(_SIX_NUMBERS, line)]
+    return np.array([_numbers(line, 6, "") for line in lines]).reshape(-1, 6)
 
 
 def _of_urdf(text: str, rows: int, columns: int) -> Float:
@@ -170,10 +189,7 @@ def _of_urdf(text: str, rows: int, columns: int) -> Float:
         raise ValueError(f"no XML: {exc}") from exc
 
     def numbers(taxel: ElementTree.Element, name: str, count: int, absent: str = "0 0 0") -> Float:
-        found = np.array(taxel.get(name, absent).split(), dtype=np.float64)
-        if found.size != count or not np.isfinite(found).all():
-            raise ValueError(f"{name}='{taxel.get(name, '')[:40]}' is not {count} numbers")
-        return found
+        return _numbers(taxel.get(name, absent), count, f"{name}=")
 
     of_skins = [s for s in tree.iter("sensor") if s.findall(".//array") or s.findall(".//taxel")]
     if len(of_skins) > 1:
@@ -183,15 +199,22 @@ def _of_urdf(text: str, rows: int, columns: int) -> Float:
         if (of_grid := (grid.get("rows", size[0]), grid.get("cols", size[1]))) != size:
             skin = f"the skin has {rows}x{columns} cells"
             raise ValueError(f"an <array> of {'x'.join(of_grid)[:40]} taxels, {skin}")
-        if len(grids) > 1 or grid.get("order", "row-major") != "row-major":
-            raise ValueError("not one <array>, row-major: leave no other in it")
+        if len(grids) > 1:
+            raise ValueError(f"{len(grids)} <array>s: leave only this skin's in the file")
+        if (order := grid.get("order", "row-major")) != "row-major":
+            raise ValueError(f"order='{order[:40]}' of its <array>: only row-major is read")
         # urdf_tactile has x along rows: its taxel_info_iterator.cpp.
-        spacing_m = numbers(grid, "spacing" if grid.get("spacing") else "size", 2)
+        spacing_m = numbers(grid, "spacing" if grid.get("spacing") else "size", 2, "")
         at_m = np.argwhere(np.ones((rows, columns))) * spacing_m
         at_m -= numbers(grid, "offset", 2, "0 0")
         return np.column_stack([at_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(at_m), 1))])
-    taxels = []
-    for taxel in sorted(tree.iter("taxel"), key=lambda taxel: int(taxel.get("idx", "0"))):
+    taxels, by_index = [], dict[int, ElementTree.Element]()
+    for place, taxel in enumerate(tree.iter("taxel")):  # without idx, in their order
+        if not re.fullmatch(r"\s*\d{1,9}\s*", index := taxel.get("idx", f"{place}")):
+            raise ValueError(f"idx='{index[:40]}' is no whole number from 0")
+        if by_index.setdefault(int(index), taxel) is not taxel:
+            raise ValueError(f"two taxels have idx='{int(index)}'")
+    for _, taxel in sorted(by_index.items()):
         turned = Rotation.from_euler("xyz", numbers(taxel, "rpy", 3))
         taxels.append([*numbers(taxel, "xyz", 3), *turned.apply([0.0, 0.0, 1.0])])
     return np.array(taxels).reshape(-1, 6)
