@@ -207,8 +207,13 @@ def test_several_go_into_a_folder_at_once(recorded: Path, tmp_path: Path, run: R
     assert "not exported: 1 of 2 recordings" in done.err
     assert [path.name for path in sorted(out.iterdir())] == ["a.npz", "b.npz"]
     assert_one_line(run(*words[:-2], "--format", "xyz"), "no format '.xyz'")
-    done = run("export", str(recorded), str(again), str(tmp_path / "one.npz"))
-    assert (done.code, "a folder takes several recordings" in done.err) == (2, True)
+    twice = run("export", str(again), str(again), str(out))
+    assert_one_line(twice, "two recordings have one name")
+    # It said "a folder takes several recordings", of a folder that nobody had made.
+    for name in ("one.npz", "forces"):
+        done = run("export", str(recorded), str(again), str(tmp_path / name))
+        assert_one_line(done, f"{name} is no folder: make it first")
+    assert_one_line(run("export", str(recorded), str(tmp_path / "forces")), "is no folder: make")
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no process is killed so")
@@ -242,6 +247,8 @@ def test_a_format_that_the_file_has_not_is_refused(
     for kind in (".csv", "csv"):
         assert_one_line(run(*words, kind), "--format .csv is of files in a folder")
     assert not (tmp_path / "out.npz").exists()
+    assert_one_line(run(*words[:2], str(tmp_path / "a.parquet")), "say --calibration")
+    assert_one_line(run(*words[:2], str(tmp_path), "--format", "parquet"), "say --calibration")
     well(run(*words, ".npz"))
     (tmp_path / "folder").mkdir()
     well(run("export", str(recorded), str(tmp_path / "folder"), "--format", "csv"))

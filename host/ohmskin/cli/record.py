@@ -243,7 +243,7 @@ def export(
     recordings: Annotated[list[Path], Argument(metavar="RECORDING", help="recordings (.mcap)")],
     out: Annotated[
         Path,
-        Argument(help=f"file to write: {', '.join(tables.FORMATS)}; or a folder for all of them"),
+        Argument(help=f"file to write: {', '.join(tables.FORMATS)}; or a folder, made before"),
     ],
     begin_s: Annotated[
         float, Option("--begin", min=0, help="from so long after the first scan, in s")
@@ -265,9 +265,13 @@ def export(
         raise ValueError(f"--format {kind} is of files in a folder, and {out} is none")
     if name_end not in tables.FORMATS:
         raise ValueError(f"no format '{name_end}': there are {', '.join(tables.FORMATS)}")
+    if not is_folder and (len(recordings) > 1 or not out.suffix):
+        raise ValueError(f"{out} is no folder: make it first, as 'mkdir {out}' does")
+    if (name_end if is_folder else out.suffix) == ".parquet" and known is None:
+        raise ValueError(".parquet has forces: say --calibration")
     pairs = [(path, out / f"{path.stem}{name_end}" if is_folder else out) for path in recordings]
     if len({to for _, to in pairs}) < len(pairs):
-        raise ValueError(f"{out}: a folder takes several recordings, of different names")
+        raise ValueError(f"{out}: two recordings have one name, and would be one file there")
     for path, to in pairs:
         check_place(to, path, calibration)
     if len(pairs) == 1:
