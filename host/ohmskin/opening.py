@@ -88,6 +88,8 @@ def _device(text: str) -> Device:
     match url.scheme:
         case "" | "socket" | "rfc2217":
             url.check_options("baud")
+            if url.scheme == "socket" and url.options:
+                raise PortError(f"{text}: a socket cannot change the speed: rfc2217:// can")
             baud = url.baud  # raises for a wrong URL, before a port is opened
             with url.blamed():
                 if url.scheme and urlsplit(text).port is None:

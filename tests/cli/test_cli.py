@@ -43,7 +43,9 @@ def test_ports(run: Run, attach: Attach) -> None:
     attach()
     said = well(run("ports")).out
     assert "no serial ports" in said
-    assert "emulator://" in said
+    for scheme in ("emulator://", "socket://", "rfc2217://"):
+        assert scheme in said
+        assert scheme in well(run("--help")).out
     assert json.loads(run("ports", "--json").out) == []
     boards = {"/dev/ttyACM0": "uno", "/dev/ttyACM1": "megaatmega2560", "/dev/ttyUSB1": ""}
     attach(*reversed(boards.items()))

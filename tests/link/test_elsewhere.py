@@ -81,6 +81,12 @@ def test_the_speed_of_a_port_elsewhere_is_set(serving: Serving) -> None:
         assert skin.info.baud == serving.port.baudrate == 1_000_000
 
 
+def test_a_plain_socket_takes_no_speed() -> None:
+    """It was taken, and the board was told to change its speed alone."""
+    with pytest.raises(PortError, match="a socket cannot change the speed: rfc2217:// can"):
+        ohmskin.open("socket://127.0.0.1:9?baud=1000000")
+
+
 def test_a_connection_that_ends_is_a_board_that_is_gone(serving: Serving) -> None:
     with ohmskin.open(serving.url) as skin:
         skin.latest()

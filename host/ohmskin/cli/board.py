@@ -87,6 +87,7 @@ def ports(as_json: Annotated[bool, Option("--json", help="one JSON array")] = Fa
     TERMINAL.print(
         "without a board: emulator://8x8?scene=ghost, simavr://uno?scene=ghost, replay://FILE.mcap"
     )
+    TERMINAL.print("of another computer: socket://robot:4000, rfc2217://robot:4000")
 
 
 def info(

@@ -67,7 +67,8 @@ _typer = typer.Typer(
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="PORT is a serial port (/dev/ttyACM0, COM3) or a URL: emulator://8x8?scene=ghost, "
-    "simavr://uno?scene=ghost, replay://FILE.mcap?speed=1. OHMSKIN_PORT may name it, too.",
+    "simavr://uno?scene=ghost, replay://FILE.mcap?speed=1; of another computer, "
+    "socket://robot:4000 or rfc2217://robot:4000. OHMSKIN_PORT may name it, too.",
 )
 
 
