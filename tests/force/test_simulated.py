@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A skin that a program presses: what comes out is what went in, as a calibrated skin has it."""
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 
@@ -87,6 +89,25 @@ def test_no_such_force(wrong: float) -> None:
         skin.step(np.full((8, 8), wrong), 0.0)
     with pytest.raises(ValueError, match="force_n has shape"):
         skin.step(np.zeros((4, 4)), 0.0)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_no_such_time(wrong: float) -> None:
+    skin = ohmskin.SimulatedSkin(of_scene("rest"))
+    with pytest.raises(ValueError, match=r"time_s is (nan|inf), not finite"):
+        skin.step(np.zeros((8, 8)), wrong)
+
+
+@pytest.mark.parametrize(
+    ("force_n", "said"),
+    [(lambda _: 1 / 0, "ZeroDivisionError"), (lambda _: np.zeros((4, 4)), "force_n has shape")],
+)
+def test_an_error_of_the_callable_is_said(force_n: Callable[[float], Float], said: str) -> None:
+    """It was called a defect of this program."""
+    skin = ohmskin.SimulatedSkin(of_scene("rest"))
+    with skin.opened(force_n) as opened, pytest.raises(ohmskin.DeviceLost) as raised:
+        next(iter(opened))
+    assert re.match(rf"simulated skin: force_n\(0\.\d+\) raised .*{said}", str(raised.value))
 
 
 def test_voltages_know_no_cells() -> None:

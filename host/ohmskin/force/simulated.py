@@ -7,6 +7,7 @@ So a policy that is trained in MuJoCo meets ghosts, noise, deviations and contac
 skin has them. It is a simulation: no textile's creep, hysteresis or drift is in it.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
@@ -20,6 +21,7 @@ from ohmskin.emulate.driver import EmulatorLink
 from ohmskin.emulate.faults import SkinFaults
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, LEAD_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
+from ohmskin.errors import DeviceLost
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
@@ -75,7 +77,7 @@ class SimulatedSkin:
         self._settings = BoardSettings(rows, columns, calibration.mode, None, calibration.unit_id)
         self._noise_lsb, self._seed = noise_lsb, seed
         self._force_n: ArrayLike = np.zeros((rows, columns))
-        self._board = self._pressed(lambda _: self._force_n)
+        self._board = self._pressed(lambda _: self._model.rise(self._force_n))
         (hello,) = BoardDecoder().feed(self._board.advance(0.0), 0.0)
         assert isinstance(hello, Hello)
         self._reader = SkinReader(hello, replace(calibration, nominal_wire_ohm=wires))
@@ -89,11 +91,11 @@ class SimulatedSkin:
         assert calibration is not None
         return calibration
 
-    def _pressed(self, force_n: Callable[[float], ArrayLike]) -> EmulatedBoard:
-        """A board whose skin these forces press at its time [s]."""
+    def _pressed(self, rise: Callable[[float], Float]) -> EmulatedBoard:
+        """A board whose skin conducts so much more (R, C) [S] at its time [s]."""
 
         def ratio(time_s: float, mode: str) -> Float:
-            siemens = self._rest.cell_siemens + self._model.rise(force_n(time_s))
+            siemens = self._rest.cell_siemens + rise(time_s)
             return SkinFaults().readings(replace(self._rest, cell_siemens=siemens), mode)
 
         return EmulatedBoard(ratio, self._settings, noise_lsb=self._noise_lsb, seed=self._seed)
@@ -102,8 +104,11 @@ class SimulatedSkin:
         """What a scan at this time shows while these forces (R, C) [N] press: no clock passes.
 
         time_s: the time of the simulation, which goes on from step to step; `ForceScan.time_ns` is
-        the same. Raises ValueError for forces of another shape, below 0 or not finite.
+        the same. Raises ValueError for forces of another shape, below 0 or not finite, and for such
+        a time.
         """
+        if not math.isfinite(time_s):
+            raise ValueError(f"time_s is {time_s:g}, not finite")
         self._force_n = force_n
         codes, mode = self._board.codes_at(time_s), self._settings.mode
         time_us, time_ns = round(1e6 * time_s), round(1e9 * time_s)
@@ -115,6 +120,14 @@ class SimulatedSkin:
         """The same skin on an emulated board in real time, as `ohmskin.open` gives one.
 
         force_n: gives the forces (R, C) [N] at a time since this call [s]; another thread asks it.
+        Where it raises an error, or gives no such forces, the scans end by DeviceLost.
         """
-        link = EmulatorLink(self._pressed(force_n), "simulated skin")
+
+        def rise(time_s: float) -> Float:
+            try:
+                return self._model.rise(force_n(time_s))
+            except Exception as exc:
+                raise DeviceLost(f"simulated skin: force_n({time_s:.3f}) raised {exc!r}") from exc
+
+        link = EmulatorLink(self._pressed(rise), "simulated skin")
         return CalibratedSkin(Session(link), self.calibration)
