@@ -16,7 +16,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-import ohmskin
 from ohmskin_mujoco import Pad
 
 MODEL = Path(__file__).with_name("gripper.xml")
@@ -28,7 +27,7 @@ def squeezed(calibration: str, seconds: float = 4.0) -> np.ndarray:
     """Columns: time [s], force of a motor, force on the skin, force that the skin shows [N]."""
     model = mujoco.MjModel.from_xml_path(str(MODEL))
     data = mujoco.MjData(model)
-    pad = Pad(model, "skin", ohmskin.load_calibration(calibration))
+    pad = Pad(model, "skin", calibration)
     rows, next_s = [], SETTLED_S
     while data.time < seconds:
         data.ctrl[:] = motor_n = 5.5 - 4.5 * np.cos(2 * np.pi * data.time / 4)
@@ -41,6 +40,8 @@ def squeezed(calibration: str, seconds: float = 4.0) -> np.ndarray:
 
 
 def main(calibration: str, picture: str = "") -> None:
+    if picture:
+        import matplotlib.pyplot as plt  # before the simulation: it may be missing
     table = squeezed(calibration)
     print(f"{'s':>6}{'motor':>8}{'on skin':>9}{'shown':>8}   newtons")
     for row in table[::30]:
@@ -49,8 +50,6 @@ def main(calibration: str, picture: str = "") -> None:
     rms = np.sqrt(np.mean(error_n**2)) / table[:, 2].mean()
     print(f"rms of shown less on skin, over the mean: {100 * rms:.2f} %")
     if picture:
-        import matplotlib.pyplot as plt
-
         for column, name in ((1, "motor"), (2, "on the skin"), (3, "shown by the skin")):
             plt.plot(table[:, 0], table[:, column], label=name)
         plt.xlabel("time [s], simulated")
@@ -64,5 +63,5 @@ if __name__ == "__main__":
         sys.exit(__doc__)
     try:
         main(*sys.argv[1:])
-    except ValueError as exc:
+    except (ImportError, ValueError) as exc:
         sys.exit(f"squeeze: {exc}")

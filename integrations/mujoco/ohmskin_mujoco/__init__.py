@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ohmskin
+from ohmskin.force.calibration import CalibrationLike, loaded
 from ohmskin.force.geometry import required
 
 Float = NDArray[np.float64]
@@ -35,8 +36,9 @@ class Pad:
     """The skin of a calibration at a site of a model, on all geoms of the site's body.
 
     model: MuJoCo's. site: the name of the site whose frame is that of the skin's geometry.
-    calibration: with a geometry (``ohmskin skin FILE --pitch-mm 10,10``). spread_m: s [m]; None:
-    the distance from a taxel to the next. seed: of the skin's wires and noise.
+    calibration: itself or the path of its file, with a geometry (``ohmskin skin FILE --pitch-mm
+    10,10``). spread_m: s [m]; None: the distance from a taxel to the next. seed: of the skin's
+    wires and noise.
 
     :raises ValueError: the model has no such site, or the calibration no geometry.
     """
@@ -45,7 +47,7 @@ class Pad:
         self,
         model: mujoco.MjModel,
         site: str,
-        calibration: ohmskin.Calibration,
+        calibration: CalibrationLike,
         *,
         spread_m: float | None = None,
         seed: int = 0,
@@ -53,6 +55,7 @@ class Pad:
         self._site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
         if self._site < 0:
             raise ValueError(f"the model has no site '{site}'")
+        calibration = loaded(calibration)
         geometry = required(calibration.geometry)
         self._model = model
         self._geoms = np.flatnonzero(model.geom_bodyid == model.site_bodyid[self._site])

@@ -85,7 +85,7 @@ def test_a_skin_of_one_cell_gets_the_whole_weight(tmp_path: Path) -> None:
 
 def test_nothing_touches_it(skin_json: str) -> None:
     model, data = resting(0.3, x=0.2)  # it has fallen beside
-    pad = Pad(model, "skin", ohmskin.load_calibration(skin_json))
+    pad = Pad(model, "skin", skin_json)  # a path, as every other class takes it
     assert not pad.force_n(data).any()
     assert not pad.read(data).contacts
 
@@ -130,3 +130,11 @@ def test_what_is_missing_is_said(skin_json: str) -> None:
     )
     line = "squeeze: no.json: cannot be read: No such file or directory\n"  # it was a traceback
     assert (done.returncode, done.stdout, done.stderr) == (1, "", line)
+    code = f"""
+import runpy, sys
+sys.modules["matplotlib"], sys.argv = None, ["squeeze.py", {skin_json!r}, "a.png"]
+runpy.run_path({str(HERE / "squeeze.py")!r}, run_name="__main__")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (1, "")  # it was said after the simulation
+    assert re.fullmatch("squeeze: .*matplotlib.*\n", done.stderr)
