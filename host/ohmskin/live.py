@@ -101,6 +101,10 @@ class LiveSkin(Closing):
         self._thread = threading.Thread(target=self._work, name=f"live {port}", daemon=True)
         self._thread.start()
 
+    def __repr__(self) -> str:
+        said = self.status.removeprefix(f"{self.port} ")
+        return f"<{type(self).__name__} {self.port}: {said}>"
+
     @property
     def status(self) -> str:
         """That scans come, or why there are none, in words."""

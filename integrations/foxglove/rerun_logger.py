@@ -8,11 +8,13 @@ Without OUT, the viewer opens. A board that is unplugged and plugged again goes 
 import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
 import ohmskin
+from ohmskin.files import check_place
 from ohmskin.force.geometry import required
 
 if len(sys.argv) not in (3, 4):
@@ -21,6 +23,8 @@ port, path, *out = sys.argv[1:]
 try:
     calibration = ohmskin.load_calibration(path)
     points = required(calibration.geometry).position_m.reshape(-1, 3)
+    for each in out:
+        check_place(Path(each), ending=".rrd")
 except ValueError as exc:
     sys.exit(f"rerun_logger: {exc}")
 rr.init("ohmskin")

@@ -54,6 +54,7 @@ def test_it_goes_on_when_it_was_unplugged_20_times(monkeypatch: pytest.MonkeyPat
     count = 0
     with LiveSkin(f"{URL}&vanish=0.1", of_scene("ghost")) as skin:
         assert skin.status == f"{skin.port} is being opened"
+        assert repr(skin) == f"<LiveSkin {skin.port}: is being opened>"
         for times in range(1, 21):
             while skin.opened <= times:
                 count, scans = skin.since(count, ENOUGH_S)

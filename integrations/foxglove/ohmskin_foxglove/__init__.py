@@ -154,6 +154,7 @@ def serve(skin: ohmskin.LiveSkin, port: int = 8765, say: Callable[[str], object]
     say: is given a line when clients may connect, and one whenever scans begin or cease to come.
 
     :raises RuntimeError: the port is taken.
+    :raises PortError: the URL of the skin's port is wrong.
     :raises ValueError: the calibration is of another skin than that at the port.
     """
     import foxglove
@@ -179,7 +180,8 @@ def serve(skin: ohmskin.LiveSkin, port: int = 8765, say: Callable[[str], object]
         say(f"Foxglove: open ws://localhost:{port}")
         said = ""
         while True:
-            if isinstance(skin.failure, ValueError):
+            # Another calibration, or a wrong URL. (What may come yet is a PortUnusable.)
+            if isinstance(skin.failure, ValueError) or type(skin.failure) is ohmskin.PortError:
                 raise skin.failure
             if (state := skin.status) != said:
                 say(said := state)

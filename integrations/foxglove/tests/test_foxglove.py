@@ -322,6 +322,15 @@ def test_a_calibration_of_another_size_is_refused(
     assert "this calibration is of a 8x8 skin, the board scans 6x6" in said.splitlines()[-1]
 
 
+def test_a_wrong_url_ends_the_server(skin_json: Path) -> None:
+    """It was tried again for ever, though no such port can come."""
+    process = subprocess.run(
+        [sys.executable, *LIVE, "bogus://x", skin_json], capture_output=True, text=True, timeout=20
+    )
+    assert process.returncode == 1
+    assert process.stderr.startswith("ohmskin-foxglove: no kind of port 'bogus://': there are")
+
+
 def test_a_board_that_went_away_is_said(skin_json: Path) -> None:
     said = said_by(*LIVE, f"{URL}&vanish=1", skin_json, seconds=12)
     assert "is gone: is the board still plugged in?" in said
@@ -351,6 +360,9 @@ def test_what_is_missing_is_said(recorded: Path, skin_json: Path, tmp_path: Path
     bare.write_text(json.dumps(content))
     said = said_by(*LOGGER, URL, bare, tmp_path / "a.rrd")
     assert said.startswith("rerun_logger: nobody has said where the cells are: ohmskin")
+    out = tmp_path / "none" / "a.rrd"
+    line = f"rerun_logger: {out}: cannot be written: say a file in a directory there is\n"
+    assert said_by(*LOGGER, URL, skin_json, out) == line  # it was a traceback
     words = ("-m", "ohmskin_foxglove", "add", recorded, bare, tmp_path / "out.mcap")
     done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True)
     assert done.returncode == 1
