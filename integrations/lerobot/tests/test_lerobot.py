@@ -156,6 +156,19 @@ def test_a_pause_loses_no_scan(skin_json: str, tmp_path: Path) -> None:
     assert numbers == sorted(number for number in given if number in range_of(numbers))
 
 
+def test_scans_that_are_in_no_frame_are_logged(
+    skin_json: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = wrapped(skin_json, tmp_path)
+    robot.connect()
+    (window,) = robot.windows
+    window._skin.close()
+    window._skin.skipped, window.lost = 3, 2
+    with caplog.at_level("INFO"):
+        robot.disconnect()
+    assert f"{URL}: 3 scans skipped by a busy machine, 2 lost in pauses" in caplog.text
+
+
 def range_of(numbers: list[float]) -> range:
     return range(int(numbers[0]), int(numbers[-1]) + 1)
 
