@@ -97,6 +97,7 @@ def test_a_pitch_is_two_numbers(file: Path, run: Run, pitch: str) -> None:
         (("--pitch-mm", "0,10"), "--pitch-mm wants two numbers above 0, as 10,10, not '0,10'"),
         (("--pitch-mm", "-1,10"), "--pitch-mm wants two numbers above 0, as 10,10, not '-1,10'"),
         (("--pitch-mm", "10,10", "--radius-mm", "5"), "8 columns of 0.01 m go round more than"),
+        (("--radius-mm", "50"), "--radius-mm needs --pitch-mm, too"),
         (("--pitch-mm", "10,10", "--taxels", "taxels.txt"), "either --taxels, or --pitch-mm"),
     ],
 )

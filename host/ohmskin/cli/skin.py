@@ -42,6 +42,8 @@ def skin(
     if taxels is not None:
         placed = Geometry.of_file(taxels, known.rows, known.columns, frame)
     elif pitch_mm or radius_mm:
+        if not pitch_mm:
+            raise ValueError("--radius-mm needs --pitch-mm, too, as 10,10")
         if not re.fullmatch(f"{_NUMBER},{_NUMBER}", pitch_mm):
             raise ValueError(f"--pitch-mm wants two numbers above 0, as 10,10, not '{pitch_mm}'")
         told = {"pitch_m": 1e-3 * np.array([float(mm) for mm in pitch_mm.split(",")])}
