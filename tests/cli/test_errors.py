@@ -87,7 +87,7 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
         ],
         ["--repeats"],
     ),
-    "missing option": (["estimate", READINGS], ["--method"]),
+    "missing option": (["estimate", READINGS], ["--out"]),
     "not a number": (["stream", EMULATED, "--scans", "many"], ["--scans"]),
 }
 
