@@ -9,7 +9,7 @@ and ports rho0. So d = exp(x) - g0 may be negative:
 
 Gauss-Newton steps on x minimise (I_read - I)^T S^-1 (I_read - I) and the prior of the cells, that
 of whole frames. S [S^2] is the covariance of I_read by noise of readings, by the wires, and by what
-the last whole frame left open of the cells outside: these are noise here.
+the last whole frame left open of the cells outside, or has changed since: these are noise here.
 
 A whole frame takes milliseconds, and a frame of a region about a tenth of that: a region may be
 read a thousand times a second.
@@ -87,8 +87,11 @@ class RegionFit:
         self._series_ohm = whole.series_ohm[region]
         square = ((self._rho + self._series_ohm) ** -2.0)[:, None]
         self._by_wires = square * by_wires
-        by_cell *= square * whole.log_cells_std
-        self._model_covariance = gram(np.hstack([self._by_wires, by_cell]))  # S, but for readings
+        by_cell *= square
+        # S, but for readings: with the last whole frame, and what comes to it with age squared.
+        self._by_age = STALE_SHARE**2 * gram(by_cell)
+        by_cell *= whole.log_cells_std
+        self._model_covariance = gram(np.hstack([self._by_wires, by_cell]))
         self.age = age
 
     def fit(self, ports: PortReadings) -> bool:
@@ -100,7 +103,7 @@ class RegionFit:
         self.age += 1
         measured = ports.current.ravel()[region]
         reading_variance = ports.current_std.ravel()[region] ** 2
-        system = self._model_covariance.copy(order="F")
+        system = self._model_covariance + self.age**2 * self._by_age
         system.ravel(order="F")[:: region.size + 1] += reading_variance
         factor = cholesky(system)
         for self.iterations in range(1, MOST_STEPS + 1):
