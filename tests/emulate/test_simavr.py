@@ -174,10 +174,14 @@ def test_pty_without_a_reader_drops_bytes_and_goes_on(simulate: Simulate) -> Non
 
 
 @pytest.mark.simavr
-def test_a_board_whose_converter_is_late_says_so_when_no_scan_comes() -> None:
-    """A silent board is asked for its hello, whose counter the host says in words."""
-    with ohmskin.open("simavr://uno?late_cycles=60") as skin:
-        skin.configure(rate_hz=0, settle_us=1)
+@pytest.mark.parametrize("speed", ["", "&baud=1000000"])
+def test_a_board_whose_converter_is_late_says_so_when_no_scan_comes(speed: str) -> None:
+    """A silent board is asked for its hello, whose counter the host says in words.
+
+    At the faster line it was asked at the default speed alone: it heard nothing, then or later.
+    """
+    with ohmskin.open(f"simavr://uno?late_cycles=800{speed}") as skin:
         with pytest.raises(DeviceLost, match=r"no scan for 3 s: \d+ conversions late: ask for a"):
             skin.latest(3.0)
         assert skin.info.late > 1000
+        skin.stop()

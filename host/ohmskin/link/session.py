@@ -77,8 +77,8 @@ _SPEED_LOST_S = 2.5
 # A silent board is asked again after so long. Chosen: the Mega's boot loader, if it took the
 # question for an upload, waits for 5 s (see `ATTEMPTS_AFTER_RESET`), and then the firmware starts.
 _ASK_AGAIN_S = 6.5
-# A board that was reset has said how it scans in this time [s], or it is told again how to. Chosen:
-# as long as an answer of `ATTEMPTS` may take.
+# A board has answered, or has said how it scans after a reset, in this time [s], or it is asked at
+# the other speed, or told again how to. Chosen: as long as an answer of `ATTEMPTS` may take.
 _BACK_S: Final = 0.3
 # A board has taken its new speed this long after its answer came. Chosen: a command that came too
 # early would be lost, and the next one would come after the board has returned to its old speed.
@@ -114,6 +114,7 @@ class Session(Device):
         self._sequence = 0  # number of the last command
         self._clock = ScanClock(time.time_ns() - round(1e9 * self.now_s))
         self._heard_s = self.now_s  # when a valid frame last came
+        self._was_asked = False  # whether it was asked since, at the speed that its hello says
         # A board that was reset is told how to scan. Until its hello says that it does so, its
         # scans count for nothing. When it is told again [s]; None: it scans as it should.
         self._tell_s: float | None = None
@@ -219,14 +220,16 @@ class Session(Device):
             for message in messages:
                 self._keep(message, now_s)
             if messages:
-                self._heard_s = now_s
+                self._heard_s, self._was_asked = now_s, False
                 self._changed.notify_all()
         silent_s = now_s - self._heard_s
         if self._want_scans and silent_s > _SPEED_LOST_S + 1 / self.info.rate_hz:
-            # A board that was reset is back at its default speed, at which its hello was not
-            # understood.
-            self._heard_s = now_s + _ASK_AGAIN_S - _SPEED_LOST_S
-            self._link.set_baud(protocol.CONSTANTS["baud_default"])
+            # A board whose conversions end too late answers at its speed. One that was reset is
+            # back at its default speed, at which its hello was not understood.
+            baud = protocol.CONSTANTS["baud_default"] if self._was_asked else self.info.baud
+            self._heard_s = now_s - _SPEED_LOST_S + (_ASK_AGAIN_S if self._was_asked else _BACK_S)
+            self._was_asked = not self._was_asked
+            self._link.set_baud(baud)
             self._send("get_hello")
 
     def _keep(self, message: Message, now_s: float) -> None:
