@@ -320,6 +320,7 @@ def test_a_late_converter_is_the_only_finding_where_no_scan_comes(run: Run) -> N
     assert found["id"] == "lost"
     assert "conversions late" in found["measured"]
     assert found["what_to_do"].startswith("lower the rate")
+    assert "--settle 0" in found["what_to_do"]  # as long as one is asked, no rate helps
 
 
 def test_a_wrong_url_is_no_finding(run: Run) -> None:

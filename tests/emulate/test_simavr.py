@@ -174,14 +174,21 @@ def test_pty_without_a_reader_drops_bytes_and_goes_on(simulate: Simulate) -> Non
 
 
 @pytest.mark.simavr
-@pytest.mark.parametrize("speed", ["", "&baud=1000000"])
-def test_a_board_whose_converter_is_late_says_so_when_no_scan_comes(speed: str) -> None:
+@pytest.mark.parametrize(
+    ("speed", "settle_us", "ask"),
+    [("", 0, "lower rate"), ("&baud=1000000", 0, "lower rate"), ("", 20, "longer settle time")],
+)
+def test_a_board_whose_converter_is_late_says_so_when_no_scan_comes(
+    speed: str, settle_us: int, ask: str
+) -> None:
     """A silent board is asked for its hello, whose counter the host says in words.
 
     At the faster line it was asked at the default speed alone: it heard nothing, then or later.
     """
+    said = rf"no scan for 3 s: \d+ conversions late: ask for a {ask}"
     with ohmskin.open(f"simavr://uno?late_cycles=800{speed}") as skin:
-        with pytest.raises(DeviceLost, match=r"no scan for 3 s: \d+ conversions late: ask for a"):
+        skin.configure(settle_us=settle_us)
+        with pytest.raises(DeviceLost, match=said):
             skin.latest(3.0)
         assert skin.info.late > 1000
         skin.stop()

@@ -210,7 +210,10 @@ class Device(Closing):
             silent = f"{self.name} has sent no scan for {limit_s:.2g} s"
             # A silent board has been asked for its hello. After a reset, it counts from 0 again.
             if (late := self.info.late) not in (0, self._late_before):
-                raise DeviceLost(f"{silent}: {late} conversions late", "ask for a lower rate")
+                # Slots for a settle time that was asked are as short at any rate.
+                longer = "longer settle time, or for 0" if self.info.settle_asked_us else ""
+                remedy = f"ask for a {longer or 'lower rate'}"
+                raise DeviceLost(f"{silent}: {late} conversions late", remedy)
             if not limit_s >= patience_s:  # so short a silence is no sign of a board that is gone
                 raise DeviceLost(silent, "wait for longer: a larger timeout_s, or none")
             silent = f"{self.name} has said nothing for {limit_s:.1f} s"
