@@ -76,6 +76,12 @@ def test_what_a_scan_has_read_can_be_asked_while_the_skin_moves() -> None:
         assert link.scene_s(Meanwhile(-1.0)) == 0.0
 
 
+def test_a_slip_is_too_fast_for_a_skin_that_is_told_now_and_then() -> None:
+    """It was taken: its 200 Hz were shown as 45 Hz, and larger."""
+    with pytest.raises(PortError, match=r"too fast .*: take emulator://8x8\?scene=slip"):
+        ohmskin.open("simavr://uno?scene=slip&begin=0")
+
+
 def test_a_weight_can_be_put_on_a_simulated_skin() -> None:
     with ohmskin.open("simavr://uno?scene=weights&rows=2&columns=2", start=False) as skin:
         skin.configure(rows=2, columns=2)

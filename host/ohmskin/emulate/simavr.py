@@ -44,7 +44,7 @@ _FAR_ENDS: Final = 0x80
 # is killed. Chosen: long even for a machine that is busy.
 _EXIT_TIMEOUT_S: Final = 2.0
 # While touches move, the simulator is told a new skin every so often [s]. Chosen: a scan at 90 Hz
-# takes 11 ms, and solving a skin of 16x16 some milliseconds.
+# takes 11 ms, and solving a skin of 16x16 some milliseconds. The scene "slip" is too fast for that.
 _TABLE_EVERY_S: Final = 0.02
 # So many of these skins are remembered, for whoever asks what a scan has read. Chosen: 20 s of
 # them, and no scan is as late.

@@ -56,6 +56,8 @@ def open_simavr(text: str) -> Session:
     settings, baud = dict(url.options), url.baud
     with url.blamed():
         scene = _scene(url, f"{settings.pop('rows', 8)}x{settings.pop('columns', 8)}")
+        if scene.name == "slip":
+            raise ValueError("a slip is too fast for simavr: take emulator://8x8?scene=slip")
         for name in (*_OF_SCENE, "baud"):
             settings.pop(name, None)
         link = SimavrLink(url.place, scene, text, settings)
