@@ -498,6 +498,17 @@ def test_a_region_may_be_told_by_arrays() -> None:
     for line in range(2):
         skin.set_region(device.Region(np.array([line]), np.array([0, line])))
         assert (skin.info.row_mask, skin.info.column_mask) == (1 << line, 1 | 1 << line)
+    skin = stepped("emulator://16x16")  # NumPy says that 1 << 9 is 0 in eight bits
+    assert skin.set_region(device.Region(np.array([9], np.uint8))).row_mask == 1 << 9
+
+
+@pytest.mark.parametrize("rows", [np.arange(3) != 1, [True, False, True], [1.5], "12", [None]])
+def test_a_region_of_what_are_no_numbers_of_lines_is_refused(rows: Any) -> None:
+    """A mask of three rows was taken for the rows 1, 0 and 1; others were a TypeError."""
+    skin = stepped(REST)
+    with pytest.raises(ValueError, match="a row is told by its number, not as"):
+        skin.set_region(device.Region(rows))
+    assert skin.info.is_whole
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Callable, Collection, Iterable, Itera
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
+from numbers import Integral
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 from weakref import WeakValueDictionary
 
@@ -79,10 +80,13 @@ class Region:
             ("column_mask", self.columns, board.columns),
         ):
             masks[name] = protocol.all_lines(count) if lines is None else 0
+            kind = name.partition("_")[0]
             for line in () if lines is None else lines:
+                if isinstance(line, bool) or not isinstance(line, Integral):
+                    raise ValueError(f"a {kind} is told by its number, not as {line!r}")
                 if not 0 <= line < count:
-                    raise ValueError(f"no {name.partition('_')[0]} {line}: there are {count}")
-                masks[name] |= 1 << line
+                    raise ValueError(f"no {kind} {line}: there are {count}")
+                masks[name] |= 1 << int(line)  # NumPy's numbers have as few bits as their type
         same = ("settle_us", "mode", "whole_every", "whole_mode")
         of_same = {name: getattr(self, name) for name in same}
         return masks | of_same | {"rate_mhz": protocol.rate_mhz(self.rate_hz)}
