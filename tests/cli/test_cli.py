@@ -7,6 +7,7 @@ import re
 import select
 import signal
 import time
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -145,10 +146,16 @@ def test_a_region_that_a_program_has_left_is_said_and_can_be_ended(
     """A program that followed contacts was killed: `info` said 4x6 cells, and `calibrate` to do
     what was done already: "this board is in mode near: 'ohmskin configure PORT --mode near'"."""
     path = pty_board("emulator://4x6").path
-    with ohmskin.open(path) as skin:
+    with ohmskin.open(path, start=False) as skin:
         skin.set_region(Region([1, 2], [0, 1, 5], mode="near", whole_every=30))
+        wholes = [scan for scan in islice(skin, 100) if scan.is_whole]
+        rate_hz, (first, *_, last) = skin.info.rate_hz, wholes
     page = well(run("info", path)).out
     assert " rows 1 2, columns 0 1 5; one scan in 30 is of all, in mode near" in page
+    made_hz = 1e6 * (last.number - first.number) / (last.time_us - first.time_us)
+    said = re.search(r"([\d.]+) Hz between whole scans, ([\d.]+) Hz with them", page)
+    assert said
+    assert list(map(float, said.groups())) == pytest.approx([rate_hz, made_hz], rel=1e-3)
     assert (
         "not all cells are scanned: 'ohmskin configure PORT --rows 4 --columns 6' changes that"
         in page

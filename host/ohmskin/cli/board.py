@@ -133,6 +133,11 @@ def _board_in_words(board: Hello) -> dict[str, str]:
     region = "all cells" if board.is_whole else f"rows {rows}, columns {columns}"
     if board.whole_every:
         region += f"; one scan in {board.whole_every} is of all, in mode {board.whole_mode}"
+    kept = f"{board.rate_hz:.2f} Hz"
+    if board.whole_every and board.whole_scan_cycles:
+        cycles = (board.whole_every - 1) * board.scan_cycles + board.whole_scan_cycles
+        made_hz = board.whole_every * board.clock_hz / cycles
+        kept += f" between whole scans, {made_hz:.2f} Hz with them"
     us = board.settle_asked_us
     settle = f"{us} us" if us else "as long as the rate allows"
     return {
@@ -144,7 +149,7 @@ def _board_in_words(board: Hello) -> dict[str, str]:
         "cells": f"{board.rows} rows, {board.columns} columns",
         "region": region,
         "mode": f"{board.mode}: readings {' '.join(MODES[board.mode])} of each cell",
-        "rate": f"{board.rate_hz:.2f} Hz (asked: {rate})",
+        "rate": f"{kept} (asked: {rate})",
         "settle time": f"{board.settle_us} us or more (asked: {settle})",
         "converter": f"{board.adc_bits} bits, {board.accuracy}",
         "references": f"{board.ref_top_ohm} Ohm top, {board.ref_bottom_ohm} Ohm bottom",
