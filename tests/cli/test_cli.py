@@ -156,10 +156,13 @@ def test_a_region_that_a_program_has_left_is_said_and_can_be_ended(
     said = re.search(r"([\d.]+) Hz between whole scans, ([\d.]+) Hz with them", page)
     assert said
     assert list(map(float, said.groups())) == pytest.approx([rate_hz, made_hz], rel=1e-3)
-    assert (
-        "not all cells are scanned: 'ohmskin configure PORT --rows 4 --columns 6' changes that"
-        in page
-    )
+    told = "not all cells are scanned: 'ohmskin configure PORT --rows 4 --columns 6' changes that"
+    assert told in page
+    for method in ("none", "joint"):  # it showed 0.0 where nothing was read
+        assert told in well(run("stream", path, "--method", method, "--scans", "1")).out
+    touched = "emulator://8x8?scene=single&begin=0&speed=0"
+    focused = well(run("stream", touched, "--focus", "--seconds", "1.5")).out
+    assert "not all cells" not in focused
     done = well(run("configure", path, "--rate", "90")).out
     assert "4x6, a region of it (see 'ohmskin info'), at 90.00 Hz" in done
     with (
@@ -170,6 +173,11 @@ def test_a_region_that_a_program_has_left_is_said_and_can_be_ended(
     assert "'ohmskin configure PORT --mode near --rows 4 --columns 6'" in str(no.value)
     well(run("configure", path, "--mode", "near", "--rows", "4", "--columns", "6"))
     assert "all cells" in well(run("info", path)).out
+    with ohmskin.open(path, start=False) as skin:
+        check_complete(skin.info)
+        skin.set_region(Region([1], [0], mode="quick", rate_hz=1000))
+    (told,) = re.findall("'ohmskin (configure) PORT (.*)'", well(run("info", path)).out)
+    well(run(told[0], path, *told[1].split()))  # it left mode and rate, if it was not refused
     with ohmskin.open(path, start=False) as skin:
         check_complete(skin.info)
 

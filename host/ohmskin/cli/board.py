@@ -22,6 +22,7 @@ from typer import Argument, Option
 import ohmskin
 from ohmskin.cli import pico
 from ohmskin.cli.terminal import Terminal
+from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.link.device import SILENCE_TIMEOUT_S, scans_for
@@ -116,13 +117,22 @@ def info(
         table.add_row("findings", ", ".join(findings) or none)
     TERMINAL.print(table)
     if not board.is_whole:
-        size = f"--rows {board.rows} --columns {board.columns}"
-        TERMINAL.print(f"not all cells are scanned: 'ohmskin configure PORT {size}' changes that")
+        TERMINAL.print(of_a_region(board))
     for finding in findings:
         doc = ENUMS["finding"].docs.get(finding, "a finding of a newer firmware")
         TERMINAL.print(Text(finding, "red") + f": {doc}")
     if findings:
         raise SystemExit(1)
+
+
+def of_a_region(board: Hello) -> str:
+    """What is said of a board that does not scan all cells, and how it does again."""
+    options = f"--rows {board.rows} --columns {board.columns}"
+    if board.mode not in ("near", "far"):
+        options += " --mode near"
+    if board.rate_asked_mhz > 1000 * DEFAULT_RATE_HZ:
+        options += " --rate 0"
+    return f"not all cells are scanned: 'ohmskin configure PORT {options}' changes that"
 
 
 def _board_in_words(board: Hello) -> dict[str, str]:

@@ -19,7 +19,7 @@ from typer import Option
 
 import ohmskin
 from ohmskin.arrays import FULL_SCALE_N, FULL_SCALE_USIEMENS, Float, numbers, shades
-from ohmskin.cli.board import REF_STD, Port, Scans, Seconds, asked_for
+from ohmskin.cli.board import REF_STD, Port, Scans, Seconds, asked_for, of_a_region
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_by_ctrl_c, ends_in_time
 from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES
@@ -30,6 +30,7 @@ from ohmskin.force.contacts import found
 from ohmskin.force.reader import ForceScan, SkinReader
 from ohmskin.link.device import Device
 from ohmskin.link.messages import Scan
+from ohmskin.record.replay import Replay
 
 _out = Terminal()
 # For tables in a file or pipe, which have no width: 16 columns, or three tables of 8 side by side.
@@ -164,6 +165,9 @@ def _picture(skin: Device, reader: SkinReader | None, shown: Scan) -> Group:
         f"scan {shown.number}  {skin.info.rate_hz:.1f} Hz  missed {stats.missed}  "
         f"damaged {stats.line.damaged}  restarts {stats.restarts}"
     )
+    follows = isinstance(skin, Replay) or (reader is not None and reader.focus is not None)
+    if not (skin.info.is_whole or follows):
+        caption += f"\n{of_a_region(skin.info)}"
     if reader is None or not isinstance(shown, ForceScan):
         title = f"{skin.name}: reading B in thousandths of Vdd"
         level = 1e3 * shown.ratio[:, :, shown.reading_names.index("b")]
