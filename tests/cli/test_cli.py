@@ -410,7 +410,12 @@ TAKES = {
     "demo": "--seconds --port --picture",
     "calibrate": "knead recording scale table weights",
 }
-NAMES = {"stream": METHODS, "estimate": METHODS, "export": (".npz", ".csv", ".parquet")}
+NAMES = {
+    "configure": ("to 32",),
+    "stream": METHODS,
+    "estimate": METHODS,
+    "export": (".npz", ".csv", ".parquet"),
+}
 
 
 @pytest.mark.parametrize("name", TAKES)

@@ -38,7 +38,7 @@ WRONG: dict[str, tuple[list[str], list[str]]] = {
     ),
     "rate out of range": (
         ["configure", EMULATED, "--rate", "60000"],
-        ["bad_rate", "1000..50000000 mHz"],
+        ["bad_rate", "1000..50000000 mHz", "(1 to 50000 scans/s)"],
     ),
     "negative rate": (["configure", EMULATED, "--rate", "-1"], ["no board scans -1.0 times"]),
     "settle time out of range": (

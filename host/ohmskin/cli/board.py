@@ -171,8 +171,10 @@ def _board_in_words(board: Hello) -> dict[str, str]:
 
 def configure(
     port: Port,
-    rows: Annotated[int | None, Option(help="rows to scan, 1 to 16")] = None,
-    columns: Annotated[int | None, Option(help="columns to scan, 1 to 16")] = None,
+    rows: Annotated[int | None, Option(help="rows to scan, 1 to 16; on a wide Mega, to 32")] = None,
+    columns: Annotated[
+        int | None, Option(help="columns to scan, 1 to 16; on a wide Mega, to 32")
+    ] = None,
     rate_hz: Annotated[float | None, Option("--rate", help="scans a second; 0: the most")] = None,
     settle_us: Annotated[
         int | None, Option("--settle", help="least settle time in us; 0: as long as the rate lets")

@@ -201,6 +201,9 @@ class Session(Device):
             reason = protocol.ENUMS["result"].docs.get(ack.result, "reason of a newer firmware")
             if ack.result in ("bad_rows", "bad_columns"):
                 reason += f" (at most {self.info.rows_max}x{self.info.columns_max})"
+            if ack.result == "bad_rate":
+                low, high = (protocol.CONSTANTS[f"rate_mhz_{end}"] for end in ("min", "max"))
+                reason += f" ({low // 1000} to {high // 1000} scans/s)"
             if ack.rate_mhz:
                 reason += f" (at most {ack.rate_mhz / 1000:g} scans/s)"
             raise CommandRefused(name, ack.result, reason)
