@@ -185,6 +185,7 @@ def test_numbers_of_the_firmware_are_those_of_its_source() -> None:
     assert [int(us) for us in settle_us.split(",")] == list(emulator.SETTLE_US.values())
     for name in ("BUSY_A_SLOT", "BUSY_A_READING", "BUSY_A_SCAN"):
         assert number(avr, name) == getattr(emulator, name)
+    assert number("core/scan_plan.cpp", "SPARE_SLOTS") == emulator.SPARE_SLOTS
     assert number(plan, "LINE_IDLE_PART") == emulator.LINE_IDLE_PART
     for name in ("IDLE_TO_CHANGE", "FEW", "IDLE_OF_FEW"):
         assert number(plan, name) == getattr(emulator, name)

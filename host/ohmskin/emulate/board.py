@@ -63,6 +63,8 @@ SETTLE_US: Final = dict(zip(protocol.MODES, (20, 35, 40, 101), strict=True))
 # Time that the processor needs for each slot, in addition for each reading, and in addition for
 # each scan [cycles] (scan_plan.h).
 BUSY_A_SLOT, BUSY_A_READING, BUSY_A_SCAN = 165, 240, 5000
+# It has the time of so many slots more where they are as long as the rate allows (scan_plan.cpp).
+SPARE_SLOTS: Final = 3
 # The line is idle for one part in so many of the time (scan_plan.h).
 LINE_IDLE_PART: Final = 8
 # At least `IDLE_TO_CHANGE` slots are idle between scans of two kinds, and at least `IDLE_OF_FEW`
@@ -437,7 +439,8 @@ def _scan_plan(wanted: dict[str, Any], baud: int) -> ScanPlan:
         slot = max(slot, (settle or SETTLE_US[mode]) * CLOCK_HZ // 1_000_000 + held)
     by_line = _line_cycles(readings, baud)
     busy = BUSY_A_SCAN + BUSY_A_READING * readings
-    slots_busy = least if rate and not settle else busy // (slot - BUSY_A_SLOT)
+    spare = SPARE_SLOTS + (IDLE_OF_FEW if readings <= FEW else 0)
+    slots_busy = readings + spare if rate and not settle else busy // (slot - BUSY_A_SLOT)
     fastest = max(slot * least, busy + BUSY_A_SLOT * slots_busy)
     result = "line_too_slow" if by_line > fastest else "too_fast"
     fastest = max(fastest, by_line)
