@@ -171,15 +171,15 @@ def test_the_belief_of_wires_is_of_a_steady_filter_and_a_wary_one(segments: int)
         mean, covariance = mixture(
             weights, np.array([steady_mean, wary_mean]), np.array([steady, wary])
         )
-    # The means of a layer that the mixture exceeds with 1 %: there its distribution has 0.99.
+    # The means of a layer that the mixture exceeds as seldom as a normal exceeds two deviations.
     shares = np.array([weights[0], *weights[1] * of_both / of_both.sum()]) / weights.sum()
     of_parts = np.array([steady, *covariances])
     logs, limit_stds = np.linspace(-3.0, 3.0, 60001), []
     for layer in range(2):
         centres = np.array([steady_mean[layer], *both_means[:, layer]]) - mean[layer]
         below = scipy.stats.norm.cdf(logs[:, None], centres, of_parts[:, layer, layer] ** 0.5)
-        limit = np.interp(0.99, below @ shares, logs)
-        limit_stds.append(limit / scipy.stats.norm.ppf(0.99))
+        limit = np.interp(scipy.stats.norm.cdf(2), below @ shares, logs)
+        limit_stds.append(limit / 2)
     layer_std = np.sqrt(np.diag(covariance))[:2]
     reach = [*np.expm1(2 * np.maximum(limit_stds, layer_std)), 2 * covariance[2, 2] ** 0.5]
     for usual in (True, False):

@@ -49,9 +49,10 @@ it was.
 Most lessons say too little to show a change. A fit takes what is believed, which has the least
 error on a skin that lies still. But if wires have just grown longer, cells conduct more than they
 seem to. The deviation of a mixture hardly shows a part that is unlikely and far away. So the upper
-limit of a layer is that of the mixture itself: the log that it exceeds with a probability of 1 %,
+limit of a layer is that of the mixture itself: the log that it exceeds as seldom as a normal
+exceeds `REACH_STDS` deviations,
 
-    sum_i p_i Phi((m_i - limit) / s_i) = 0.01 ,
+    sum_i p_i Phi((m_i - limit) / s_i) = Phi(-REACH_STDS) ,
 
 where each part i (steady; wary, stayed; wary, changed) has the probability p_i and a normal.
 """
@@ -70,6 +71,7 @@ from ohmskin.estimate.prior import (
     CHANGED_ODDS,
     LAYER_STD,
     MEMORY,
+    REACH_STDS,
     STEADY_FADE,
     USUAL_LAYER_STD,
     USUAL_LEAD_STD_OHM,
@@ -81,9 +83,6 @@ from ohmskin.estimate.wire_belief import LARGE_MOVE_LOG, Fit, Lesson, WireBelief
 # A fingertip is the same as that of the last lesson if both are more alike. Chosen: on 16x16, it
 # has to move by about its width.
 SAME_TIP: Final = 0.6
-# The probability that a layer is longer than its upper limit. Chosen: less than at 2 deviations of
-# a normal, because wires that change at once are rare, and errors are large then.
-LONGER_CHANCE: Final = 0.01
 # The limit is between those of the parts. This interval is halved so often. Chosen: it is found to
 # a billionth.
 _HALVINGS: Final = 30
@@ -130,12 +129,12 @@ def _mixture(one: _Filter, other: _Filter, odds: float) -> tuple[_Filter, float]
     return _Filter(one.means + share * apart, covariance, float(score)), share
 
 
-def _exceeded(parts: Sequence[tuple[float, float, float]], chance: float) -> float:
-    """What a mixture of normals exceeds with this probability.
+def _exceeded(parts: Sequence[tuple[float, float, float]], stds: float) -> float:
+    """What a mixture of normals exceeds as seldom as one normal exceeds so many deviations.
 
     parts: of each, its share, mean and standard deviation.
     """
-    stds = NormalDist().inv_cdf(1.0 - chance)
+    chance = NormalDist().cdf(-stds)
     alone = [mean + stds * std for _, mean, std in parts]
     low, high = min(alone), max(alone)
     for _ in range(_HALVINGS):
@@ -276,5 +275,5 @@ class LearnedWires(WireBelief):
                 (share, part.means[layer], math.sqrt(part.covariance[layer, layer]))
                 for share, part in self._parts
             ]
-            limits.append(_exceeded(of_layer, LONGER_CHANCE) - self._known.means[layer])
-        return np.array(limits) / NormalDist().inv_cdf(1.0 - LONGER_CHANCE)
+            limits.append(_exceeded(of_layer, REACH_STDS) - self._known.means[layer])
+        return np.array(limits) / REACH_STDS
