@@ -350,6 +350,18 @@ def test_cells_that_have_left_a_region_stay_as_it_has_read_them() -> None:
     assert away.cell_siemens_std[3, 5] > near.cell_siemens_std[3, 5]
 
 
+def test_what_cells_outside_may_have_become_makes_a_region_less_certain() -> None:
+    """Half of a fingertip is read, again and again; the other half may press as it likes."""
+    made, rest, frames = trial("finger")
+    row, column = np.unravel_index(made.cell_siemens[0].argmax(), (8, 8))
+    rows, columns = slice(max(row - 2, 0), row + 1), slice(max(column - 2, 0), column + 3)
+    estimator = make_estimator("joint", knowledge(rest))
+    estimator.estimate(frames[0])
+    part = of_region(frames[0], rows, columns, READ["near"])
+    stds = [estimator.estimate(part).cell_siemens_std[row, column] for _ in range(25)]
+    assert stds[-1] > 1.2 * stds[0]
+
+
 def test_what_a_whole_frame_cannot_be_relied_on_for_no_region_is() -> None:
     """A cell that conducts more than any touch, then frames of another region."""
     known, frame = read_with(1 / 20, 5, 5)
