@@ -13,6 +13,7 @@ from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.estimate import full_fit
 from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.cells_at_rest import CellsAtRest
 from ohmskin.estimate.full_fit import FullFit
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
@@ -445,3 +446,31 @@ def test_a_shortened_step_that_turns_back_is_shortened_more() -> None:
     assert full_fit._damped(0.5 * before, before, 0.25) == pytest.approx(
         0.5
     )  # too short, so longer
+
+
+@pytest.mark.parametrize(("longer_ohm", "is_fitted_again"), [(250.0, False), (600.0, True)])
+def test_cells_at_rest_follow_wires_that_turn_out_longer(
+    longer_ohm: float, is_fitted_again: bool
+) -> None:
+    """By their slopes where these hold, and by another fit of the rest readings where not."""
+    wires = (np.full((16, 16), ohm) for ohm in (200.0, 300.0))
+    skin = Skin(np.full((16, 16), 1e-6), *wires)
+    reader = PortReader(SkinKnowledge(16, 16))
+    rest = reader.read(readings(skin))
+
+    def follow(layers_log: float, *, at_once: bool) -> CellPrior:
+        belief = LearnedWires((16, 16), WireOhm())
+        at_rest = CellsAtRest(rest, belief, 1e4)
+        before = None if at_once else at_rest.of_frame(rest)
+        moved = belief.means.copy()
+        moved[:2] = layers_log
+        belief._believe(moved, belief._known.covariance)
+        belief.expect_usual(False)
+        after = at_rest.of_frame(rest)
+        if before is not None:
+            assert (after.by_means is not before.by_means) == is_fitted_again
+        return after
+
+    longer_log = np.log(longer_ohm)
+    followed, at_once = (follow(longer_log, at_once=which).expected for which in (False, True))
+    assert np.abs(followed - at_once).max() < 0.2 * REST_STD

@@ -50,6 +50,8 @@ LEAK_STD: Final = 0.2
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
 # by less than their rounding.
 LEAD_MOVE_OHM: Final = 20.0
+# Slopes of cells at rest hold until the logs of cells err by this share of `REST_STD`.
+BENT_SHARE: Final = 0.1
 # Single segments are learned if a line resists more than this from end to end [ohm], on skins of
 # at most so many cells. Chosen: with shorter lines it gains nothing, and larger skins take long.
 LEARNED_LINE_OHM: Final = 2400.0
@@ -130,7 +132,7 @@ class CellsAtRest:
         # move, the rest readings are fitted again. (Readings at far ends hardly depend on the
         # layers.)
         near = not any(self._belief.far)
-        if near and np.abs(means - self._means)[:2].max() > LARGE_MOVE_LOG:
+        if near and self._bends_slopes(prior, means):
             return self._by_rest(rest, prior)
         least_log = 0.5 * (LAYER_STD if all(self._belief.far) else SEGMENT_STD)
         least = np.full(means.size, 0.5 * SEGMENT_STD)
@@ -139,6 +141,18 @@ class CellsAtRest:
         leaks = self._belief.leaks(least)
         leaks[:] = np.maximum(SEGMENT_STD * np.abs(self._belief.leaks(means)), LEAK_MOVE_US)
         return prior.about(means) if (np.abs(means - prior.means) > least).any() else prior
+
+    def _bends_slopes(self, prior: CellPrior, means: Float) -> bool:
+        """Whether the layers have moved further than the slopes of cells at rest hold.
+
+        Cells follow the ohms of wires nearly linearly, but slopes are by their logs. So after a
+        move by d, a slope errs by e^d - 1 - d.
+        """
+        move = (means - self._means)[:2]
+        if self.are_hidden:  # cells have no slopes then
+            return bool(np.abs(move).max() > LARGE_MOVE_LOG)
+        off_log = prior.by_means[:, :2] @ (np.expm1(move) - move)
+        return bool(np.abs(off_log).max() > BENT_SHARE * REST_STD)
 
     def _by_level(self, ports: PortReadings) -> CellPrior:
         """All cells at the lowest level that this frame or one before it has shown.
