@@ -71,8 +71,17 @@ def test_sensed_ports_and_their_slopes_are_a_laplacians(
             ends.append(sensed_ohm(skin(moved), far).ravel())
         slope = (ends[1] - ends[0]) / 2e-4
         np.testing.assert_allclose(slopes[:, number], slope, atol=3e-6 * expected.max())
-    layers = circuit.by_wires().reshape(-1, 2, whole.cell_siemens.size).sum(axis=2)
+    by_wires = circuit.by_wires()
+    by_top, by_bottom = by_wires.reshape(-1, 2, *size).transpose(1, 0, 2, 3)
+    by_lines = np.hstack([by_top.sum(axis=2), by_bottom.sum(axis=1)])
+    np.testing.assert_allclose(circuit.by_lines(), by_lines, atol=1e-9 * expected.max())
+    layers = np.stack([by_top.sum(axis=(1, 2)), by_bottom.sum(axis=(1, 2))], axis=1)
     np.testing.assert_allclose(circuit.by_layers(), layers, atol=1e-9 * expected.max())
+    weight = random.uniform(0.1, 10.0, len(by_wires))
+    bound = circuit.most_by_wires(weight) * (1 + 1e-9)
+    assert (np.abs(weight[:, None] * by_wires) <= bound).all()
+    some = np.flatnonzero(np.arange(by_wires.shape[1]) % 3 == 1)
+    np.testing.assert_array_equal(circuit.by_wires(some), by_wires[:, some])
 
 
 def test_what_wires_lose_is_the_current_through_their_segments() -> None:

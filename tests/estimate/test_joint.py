@@ -474,3 +474,19 @@ def test_cells_at_rest_follow_wires_that_turn_out_longer(
     longer_log = np.log(longer_ohm)
     followed, at_once = (follow(longer_log, at_once=which).expected for which in (False, True))
     assert np.abs(followed - at_once).max() < 0.2 * REST_STD
+
+
+def test_segments_that_carry_no_current_may_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A finger on 16x16 is answered the same with all segments as noise."""
+    frames = finger_trial(16, 16, 3, 5).rounded(10, wires_told=False)
+
+    def answers() -> list[Estimate]:
+        estimator = make_estimator("joint", frames.knowledge(0))
+        return [estimator.estimate(ratio) for ratio in frames.ratio]
+
+    some = answers()
+    monkeypatch.setattr(full_fit, "LEAST_SEGMENT_STDS", 0.0)
+    for one, whole in zip(some, answers(), strict=True):
+        off = np.abs(one.cell_siemens - whole.cell_siemens) / whole.cell_siemens_std
+        assert 0.0 < off.max() < 0.05
+        np.testing.assert_allclose(one.cell_siemens_std, whole.cell_siemens_std, rtol=0.02)

@@ -38,7 +38,8 @@ def solve_ports(cell_siemens: Float) -> tuple[Float, Float]:
 
 def port_difference(lines: Float, rows: int) -> Float:
     """For each port, the values of its row less those of its column: (RC, n), from (R+C, n)."""
-    return (lines[:rows, None] - lines[None, rows:]).reshape(-1, lines.shape[1])
+    ports = rows * (len(lines) - rows)
+    return (lines[:rows, None] - lines[None, rows:]).reshape(ports, lines.shape[1])
 
 
 def wire_current(cell_current: Float) -> Float:
@@ -180,14 +181,11 @@ class PortCircuit:
         return np.asarray(current[:rows].transpose(2, 0, 1) - by_column)
 
     def _slopes(self, current: Float, sensed: Float, ohm: Float) -> Float:
-        """r_e i_e j_e of all ports, (RC, resistances), from currents of lines (R+C, ...)."""
+        """r_e i_e j_e of all ports, (RC, k), from currents of lines, (R+C, k), and r, (k,)."""
         # Lines are fewer than ports: so r_e is multiplied by first.
-        root = np.sqrt(ohm.ravel())
-        slopes = port_difference(current.reshape(len(current), -1) * root, self.rows)
-        if sensed is current:
-            slopes *= slopes
-        else:
-            slopes *= port_difference(sensed.reshape(len(sensed), -1) * root, self.rows)
+        root = np.sqrt(ohm)
+        slopes = port_difference(current * root, self.rows)
+        slopes *= port_difference(sensed * root, self.rows) if any(self.far) else slopes
         return slopes
 
     def shorted_port_ohm(self, first: NDArray[np.intp], short_ohm: float) -> Float:
@@ -209,35 +207,81 @@ class PortCircuit:
 
     def by_cell(self) -> Float:
         """Slopes by the log resistance of each cell, (RC, RC) [ohm]."""
-        return self._slopes(self.cell_current, self.sense_current, self._root**-2.0)
+        current, sensed = _of_lines(self.cell_current), _of_lines(self.sense_current)
+        return self._slopes(current, sensed, self._root.ravel() ** -2.0)
 
-    def by_wires(self) -> Float:
-        """Slopes by the log of each wire segment, (RC, 2RC) [ohm]: top segments come first."""
-        ohm = np.empty((2, *self.shape))
-        ohm[0], ohm[1] = self.wire_ohm
-        return self._slopes(self._wire_current, self._wire_sense_current, ohm)
+    @cached_property
+    def segment_ohm(self) -> Float:
+        """All wire segments, those of the top layer first, (2RC,) [ohm]."""
+        return np.stack([np.broadcast_to(ohm, self.shape) for ohm in self.wire_ohm]).ravel()
+
+    def by_wires(self, some: NDArray[np.intp] | slice = slice(None)) -> Float:
+        """Slopes by the log of each wire segment, (RC, 2RC) [ohm]: top segments come first.
+
+        some: only by these segments.
+        """
+        current, sensed = _of_lines(self._wire_current), _of_lines(self._wire_sense_current)
+        return self._slopes(current[:, some], sensed[:, some], self.segment_ohm[some])
+
+    def most_by_wires(self, weight: Float) -> Float:
+        """No slope of `by_wires`, times the weight of its port, is larger than this, (2RC,).
+
+        weight: of each port, at least 0, (RC,).
+
+        With i = a - b of the row and the column of a port, i^2 is at most 2 a^2 + 2 b^2, and of two
+        currents i j is at most the mean of their squares.
+        """
+        by_port = weight.reshape(self.shape)
+        of_lines = np.concatenate([by_port.max(axis=1), by_port.max(axis=0)])
+        square = np.zeros(2 * by_port.size)
+        for current in (self._wire_current, self._wire_sense_current):
+            each = of_lines[:, None] * _of_lines(current) ** 2
+            square += each[: self.rows].max(axis=0) + each[self.rows :].max(axis=0)
+        return self.segment_ohm * square
+
+    def by_lines(self) -> Float:
+        """Slopes by the log of all segments of a line together, (RC, R+C) [ohm]: rows first."""
+        top, bottom = self.segment_ohm.reshape(2, *self.shape)
+        (rows, columns), (rows_sensed, columns_sensed) = (
+            (each[:, 0].transpose(1, 0, 2), each[:, 1].transpose(2, 0, 1))
+            for each in (self._wire_current, self._wire_sense_current)
+        )
+        by_row = (rows * top[:, None]) @ rows_sensed.transpose(0, 2, 1)
+        by_column = (columns * bottom.T[:, None]) @ columns_sensed.transpose(0, 2, 1)
+        return self._slopes_of_sums(np.concatenate([by_row, by_column]))
 
     def by_layers(self) -> Float:
-        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm].
-
-        With i = a - b of the row and the column of a port, and j = a' - b', the sum of r i j is
-        that of r a a', less those of r a b' and r b a', and that of r b b': sums of lines are
-        enough.
-        """
-        rows, lines, ohm = self.rows, sum(self.shape), [np.ravel(one) for one in self.wire_ohm]
+        """Slopes by the log of all segments of a layer together, (RC, 2) [ohm]."""
+        lines, ohm = sum(self.shape), self.segment_ohm.reshape(2, -1)
         current = self._wire_current.reshape(lines, 2, -1).transpose(1, 0, 2)
         sensed = self._wire_sense_current.reshape(lines, 2, -1).transpose(1, 2, 0)
-        sums = np.stack([(current[layer] * ohm[layer]) @ sensed[layer] for layer in (0, 1)])
-        own = np.einsum("lii->li", sums)
+        return self._slopes_of_sums(
+            np.stack([(current[layer] * ohm[layer]) @ sensed[layer] for layer in (0, 1)])
+        )
+
+    def _slopes_of_sums(self, sums: Float) -> Float:
+        """The sums of r i j over some segments, (RC, k), for each of k sets of segments.
+
+        With i = a - b of the row and the column of a port, and j = a' - b', this is the sum of
+        r a a', less those of r a b' and r b a', and that of r b b': sums of lines are enough.
+
+        sums: of r a a' for each two lines, (k, R+C, R+C) [ohm].
+        """
+        rows, own = self.rows, np.einsum("kll->kl", sums)
         slopes = own[:, :rows, None] + own[:, None, rows:] - sums[:, :rows, rows:]
         slopes -= sums[:, rows:, :rows].transpose(0, 2, 1)
-        return np.asarray(slopes.reshape(2, -1).T)
+        return np.asarray(slopes.reshape(len(sums), -1).T)
 
     def by_leaks(self) -> Float:
         """Slopes by the leaks of rows, and of columns, (RC, 2) [ohm / S]."""
         volt = port_difference(self.impedance.T, self.rows)
         sensed = port_difference(self.sensed.T, self.rows)
         return leak_slopes(volt, sensed, self.shape)
+
+
+def _of_lines(current: Float) -> Float:
+    """(R+C, k), from currents of lines through k resistances in whatever shape."""
+    return current.reshape(len(current), -1)
 
 
 def leak_slopes(volt: Float, sensed: Float, shape: tuple[int, int]) -> Float:

@@ -17,8 +17,9 @@ P      (RC+n, RC+n)   covariance of the prior
 u      (RC + n,)      deviations from the prior: x = m + P^1/2 u                    1
 y, h   (RC,)          measured and modelled port currents per Vdd, over their noise 1
 J      (RC, RC + n)   dh / du                                                       1
-W      (RC, 2RC)      dh / dw times s, where w are the log segments, and s the      1
-                      deviation of each from its mean; 0 if x has that
+W      (RC, k)        dh / dw times s, where w are the logs of those k segments     1
+                      that matter (`LEAST_SEGMENT_STDS`), and s the deviation of
+                      each from its mean; 0 if x has that
 N      (RC, RC)       covariance of y by its noise and by W: by all that x lacks    1
 S      (RC, RC)       covariance of y by all that is not certain, N + J J^T         1
 O      (RC, RC + n)   J whitened: L^-1 J, with L L^T = S                            1
@@ -75,6 +76,10 @@ OLD_LOG: Final = 0.15
 FOLLOWS_LOG: Final = 0.4
 # N is made anew if a log resistance may have moved by more since. Chosen: N only weighs readings.
 OLD_NOISE_LOG: Final = 0.5
+# A segment matters if what it differs from its mean by may move a reading by more deviations of
+# this reading's noise. Chosen: most segments carry next to no current, and all that do not matter
+# add 1 % to the variance of a reading.
+LEAST_SEGMENT_STDS: Final = 0.05
 # What explains a frame better by less does not count (`FullFit.gains_of_shorts`). Chosen: half of a
 # normal residual gains as much by chance.
 LEAST_PULL: Final = 2.0
@@ -151,17 +156,16 @@ class FullFit:
     def _linearise(self) -> None:
         """Make J, N and S for the present state."""
         self._moved_log = 0.0
-        wants_noise = self._moved_since_noise > OLD_NOISE_LOG
-        wants_segments = wants_noise or self._belief.learns_segments
-        by_wires = self._circuit.by_wires() if wants_segments else self._circuit.by_layers()
+        learns_segments = self._belief.learns_segments
+        by_wires = self._circuit.by_wires() if learns_segments else self._circuit.by_layers()
         by_leaks = 1e-6 * self._circuit.by_leaks() if self._belief.has_leaks else None  # by uS
         direct = self._belief.by_means(by_wires, self._means, by_leaks=by_leaks)
         self._by_cell = self._weighted(self._circuit.by_cell())
         # Cells at rest follow the means of the wires.
         by_rest = self._by_cell @ self._prior.by_means
         self._by_mean = self._weighted(direct) + by_rest
-        if wants_noise:
-            self._make_noise(by_wires)
+        if self._moved_since_noise > OLD_NOISE_LOG:
+            self._make_noise()
         moving = np.zeros_like(self._by_mean) if self._holds_wires else self._by_mean
         self._per_mean_std = self._belief.per_mean_std(moving)
         self._cell_std = np.sqrt(self._variance)
@@ -171,19 +175,16 @@ class FullFit:
         slopes[:, cells:] = self._per_mean_std
         self._factor = gram_factor(slopes, self._noise)  # L
 
-    def _make_noise(self, by_wires: Float) -> None:
-        """Make N, and W without s, for the present state.
-
-        by_wires: slopes of rho by all segments, (RC, 2RC), which are overwritten.
-        """
+    def _make_noise(self) -> None:
+        """Make N, and W without s, for the present state."""
         self._moved_since_noise = 0.0
-        self._by_segment = self._weighted(by_wires)
-        if own_std := self._belief.unlearned_std:
-            self._noise = gram(self._by_segment)
-            self._noise *= own_std**2
-        else:
-            self._noise = np.zeros((self._weight.size,) * 2, order="F")
-        np.einsum("ii->i", self._noise)[:] += 1.0
+        own_std = self._belief.unlearned_std
+        most = self._circuit.most_by_wires(self._weight * self._modelled**2)
+        self._segments = np.flatnonzero(own_std * most > LEAST_SEGMENT_STDS)
+        self._by_segment = self._weighted(self._circuit.by_wires(self._segments))
+        self._noise = np.eye(self._weight.size, order="F")
+        if self._segments.size:
+            self._noise = gram(own_std * self._by_segment, self._noise)
 
     def _minimise(self) -> None:
         """Take steps until one leaves out next to nothing (`_is_last`).
@@ -270,7 +271,8 @@ class FullFit:
         covariance is S, the most probable differences, over s, are W^T S^-1 times the residual.
         """
         own_std = self._belief.unlearned_std
-        segments_stds = own_std * (self._probable_noise @ self._by_segment)
+        segments_stds = np.zeros(2 * self._weight.size)
+        segments_stds[self._segments] = own_std * (self._probable_noise @ self._by_segment)
         self._wires_square = float(segments_stds @ segments_stds)
         return self._belief.wires_off(self._mean_stds, own_std * segments_stds)
 
@@ -426,9 +428,7 @@ class FullFit:
 
     def gains_of_yarns(self) -> Float:
         """How much better a broken yarn of each line explains the frame, (R+C,): as for shorts."""
-        rows, columns = self._circuit.shape
-        by_wires = self._by_segment.reshape(-1, 2, rows, columns)
-        return self._gains(np.hstack([by_wires[:, 0].sum(axis=2), by_wires[:, 1].sum(axis=1)]))
+        return self._gains(self._weighted(self._circuit.by_lines()))
 
     def _gains(self, changes: Float) -> Float:
         """How much better the frame is explained if h changes so, (k,), from (RC, k).

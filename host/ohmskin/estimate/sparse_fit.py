@@ -120,7 +120,6 @@ class RestNetwork(PortCircuit):
         self.cell_volt.ravel()[:: siemens.size + 1] += 1.0 / siemens
         self.own_slope = self.port_volt.diagonal() * self.sense_volt.diagonal()
         self.own_volt = self.cell_volt.diagonal()
-        self._segment_ohm = np.stack([np.broadcast_to(ohm, self.shape) for ohm in self.wire_ohm])
 
     def by_wires_of(self, ports: Cells, cell_current: Float, sense_current: Float) -> Float:
         """d rho / dw of all wires, (m, 2RC) [ohm], from cell currents of ports, (m, RC).
@@ -138,7 +137,7 @@ class RestNetwork(PortCircuit):
             slopes *= sensed
         else:
             slopes *= slopes
-        slopes *= self._segment_ohm
+        slopes *= self.segment_ohm.reshape(2, *self.shape)
         return slopes.reshape(len(cell_current), -1)
 
 
