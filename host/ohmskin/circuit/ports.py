@@ -213,7 +213,9 @@ class PortCircuit:
     @cached_property
     def segment_ohm(self) -> Float:
         """All wire segments, those of the top layer first, (2RC,) [ohm]."""
-        return np.stack([np.broadcast_to(ohm, self.shape) for ohm in self.wire_ohm]).ravel()
+        ohm = np.empty((2, *self.shape))
+        ohm[0], ohm[1] = self.wire_ohm  # faster than to broadcast and stack them
+        return ohm.ravel()
 
     def by_wires(self, some: NDArray[np.intp] | slice = slice(None)) -> Float:
         """Slopes by the log of each wire segment, (RC, 2RC) [ohm]: top segments come first.
