@@ -80,6 +80,9 @@ OLD_NOISE_LOG: Final = 0.5
 # this reading's noise. Chosen: most segments carry next to no current, and all that do not matter
 # add 1 % to the variance of a reading.
 LEAST_SEGMENT_STDS: Final = 0.05
+# Skins of at most so many cells have all segments in W. Chosen: to find out which matter takes
+# longer there than it saves.
+SMALL_CELLS: Final = 128
 # What explains a frame better by less does not count (`FullFit.gains_of_shorts`). Chosen: half of a
 # normal residual gains as much by chance.
 LEAST_PULL: Final = 2.0
@@ -156,16 +159,18 @@ class FullFit:
     def _linearise(self) -> None:
         """Make J, N and S for the present state."""
         self._moved_log = 0.0
-        learns_segments = self._belief.learns_segments
-        by_wires = self._circuit.by_wires() if learns_segments else self._circuit.by_layers()
+        wants_noise = self._moved_since_noise > OLD_NOISE_LOG
+        wants_all = wants_noise and self._weight.size <= SMALL_CELLS
+        wants_all |= self._belief.learns_segments
+        by_wires = self._circuit.by_wires() if wants_all else self._circuit.by_layers()
         by_leaks = 1e-6 * self._circuit.by_leaks() if self._belief.has_leaks else None  # by uS
         direct = self._belief.by_means(by_wires, self._means, by_leaks=by_leaks)
         self._by_cell = self._weighted(self._circuit.by_cell())
         # Cells at rest follow the means of the wires.
         by_rest = self._by_cell @ self._prior.by_means
         self._by_mean = self._weighted(direct) + by_rest
-        if self._moved_since_noise > OLD_NOISE_LOG:
-            self._make_noise()
+        if wants_noise:
+            self._make_noise(by_wires if wants_all else None)
         moving = np.zeros_like(self._by_mean) if self._holds_wires else self._by_mean
         self._per_mean_std = self._belief.per_mean_std(moving)
         self._cell_std = np.sqrt(self._variance)
@@ -175,15 +180,22 @@ class FullFit:
         slopes[:, cells:] = self._per_mean_std
         self._factor = gram_factor(slopes, self._noise)  # L
 
-    def _make_noise(self) -> None:
-        """Make N, and W without s, for the present state."""
+    def _make_noise(self, by_wires: Float | None) -> None:
+        """Make N, and W without s, for the present state.
+
+        by_wires: slopes of rho by all segments, (RC, 2RC), which are overwritten; None: W is made
+            of those that matter.
+        """
         self._moved_since_noise = 0.0
         own_std = self._belief.unlearned_std
-        most = self._circuit.most_by_wires(self._weight * self._modelled**2)
-        self._segments = np.flatnonzero(own_std * most > LEAST_SEGMENT_STDS)
-        self._by_segment = self._weighted(self._circuit.by_wires(self._segments))
+        self._segments: NDArray[np.intp] | slice = slice(None)
+        if by_wires is None:
+            most = self._circuit.most_by_wires(self._weight * self._modelled**2)
+            self._segments = np.flatnonzero(own_std * most > LEAST_SEGMENT_STDS)
+            by_wires = self._circuit.by_wires(self._segments)
+        self._by_segment = self._weighted(by_wires)
         self._noise = np.eye(self._weight.size, order="F")
-        if self._segments.size:
+        if own_std and self._by_segment.size:
             self._noise = gram(own_std * self._by_segment, self._noise)
 
     def _minimise(self) -> None:
