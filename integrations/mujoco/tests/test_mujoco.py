@@ -4,6 +4,7 @@
 import re
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import ohmskin
 from ohmskin_mujoco import Pad
 
 HERE = Path(__file__).parents[1]
+POWER = HERE.parents[1] / "examples" / "presses.csv"
 TOLD = ("--wires", "100,200", "--leads", "80")
 WEIGHT = """<mujoco><option timestep="0.001"/><worldbody>
 <body name="plate"><geom type="box" size="0.04 0.04 0.005" pos="0 0 -0.005"/>
@@ -23,9 +25,11 @@ WEIGHT = """<mujoco><option timestep="0.001"/><worldbody>
 </worldbody></mujoco>"""
 
 
-def calibrated(path: Path, presses: Path, skin: str = "emulator://8x8") -> str:
+def calibrated(
+    path: Path, presses: Path, skin: str = "emulator://8x8", told: Iterable[str] = TOLD
+) -> str:
     for words in (
-        ("calibrate", "table", skin, presses, path, "--indenter-mm2", "80", *TOLD),
+        ("calibrate", "table", skin, presses, path, "--indenter-mm2", "80", *told),
         ("skin", path, "--pitch-mm", "10,10"),
     ):
         subprocess.run([sys.executable, "-m", "ohmskin", *map(str, words)], check=True)
@@ -41,8 +45,7 @@ def skin_json(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture(scope="module")
 def power_json(tmp_path_factory: pytest.TempPathFactory) -> str:
     """By presses of the emulated skin, whose law is a power."""
-    presses = HERE.parents[1] / "examples" / "presses.csv"
-    return calibrated(tmp_path_factory.mktemp("power") / "skin.json", presses)
+    return calibrated(tmp_path_factory.mktemp("power") / "skin.json", POWER)
 
 
 def resting(kg: float, x: float = 0.0, y: float = 0.0) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -105,6 +108,18 @@ def test_1_to_10_newtons_are_shown(
     rms = np.sqrt(np.mean((shown_n - on_skin_n) ** 2)) / on_skin_n.mean()
     print(f"figure: {calibration}: total force shown, rms over the mean: {100 * rms:.2f} %")
     assert rms < share
+
+
+def test_one_cell_shows_too_little_with_and_without_a_clock(tmp_path: Path) -> None:
+    """10 N on one cell, where nobody has told the wires; spread over a pitch, they are right."""
+    sys.path.insert(0, str(HERE))
+    from spread import shown
+
+    untold = calibrated(tmp_path / "skin.json", POWER, told=())
+    for spread, least_n, most_n in ((0.2, 4.0, 7.0), (1.0, 9.6, 10.4)):
+        _, *sums = shown(untold, spread)
+        for sum_n in sums:
+            assert least_n < sum_n < most_n
 
 
 def test_the_program_of_the_page_runs(
