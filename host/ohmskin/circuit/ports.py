@@ -36,6 +36,21 @@ def solve_ports(cell_siemens: Float) -> tuple[Float, Float]:
     return np.maximum(port_ohm, 0.0), impedance
 
 
+def cells_of_ports(port_siemens: Float) -> Float:
+    """About what cells conduct, (R, C) [S], whose stripes have no resistance and whose ports
+    conduct G, (R, C), all > 0.
+
+    A port also conducts by paths around its cell: through the other cells of its row, and then
+    those of its column. With G_row and G_column the sums of the other G of both, and P = G_row
+    G_column / (G_row + G_column), a cell is taken for G^2 / (G + P).
+    """
+    by_row, by_column = (
+        port_siemens.sum(axis=axis, keepdims=True) - port_siemens for axis in (1, 0)
+    )
+    around = by_row * by_column / np.maximum(by_row + by_column, np.finfo(np.float64).tiny)
+    return np.asarray(port_siemens * port_siemens / (port_siemens + around))
+
+
 def port_difference(lines: Float, rows: int) -> Float:
     """For each port, the values of its row less those of its column: (RC, n), from (R+C, n)."""
     ports = rows * (len(lines) - rows)

@@ -60,6 +60,9 @@ PALM_TIMES: Final = 10.0
 # wire must not be neglected, and it may hide touches behind it. Chosen: 8 segments of 3 kOhm. From
 # there on, a fit that starts at rest takes fewer steps.
 LONG_LINE_OHM: Final = 24e3
+# Where a fit starts from what `matrix` finds, that ends below this chi-square per port. Chosen: one
+# step is enough, and with less the answers are the same.
+START_CHI2: Final = 4.0
 # Why such a frame is no answer.
 BEYOND_REGION: Final = "something has changed outside of the region: read the whole skin"
 
@@ -120,8 +123,6 @@ class JointEstimator(Estimator):
         answers may differ from those of a new estimator, by a small part of their deviations.
         """
         super().reset()
-        # (R, C) [S]: what `matrix` found in the last frame that it was asked about.
-        self._cells_before: Float | None = None
         self._touches = 0  # touched cells in the last fit
         self._staying = StayingFaults(self._shape)
         # The last whole frame, for regions of the frames after it; and the last region.
@@ -393,10 +394,8 @@ class JointEstimator(Estimator):
             return touches.log_cells
         if all(self._belief.far) and self._belief.line_ohm() > LONG_LINE_OHM:
             return prior.expected
-        # `matrix` may end early: cells that miss each reading by one deviation are a good start.
-        tolerance = float(ports.current.size)
-        fit = CellFit(ports, self.knowledge.ref_ohm, self._cells_before, tolerance)
-        self._cells_before = None if fit.message else fit.best.cell
+        tolerance = START_CHI2 * ports.current.size
+        fit = CellFit(ports, self.knowledge.ref_ohm, None, tolerance)
         siemens = np.minimum(fit.best.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
         # No cell starts at more resistance than at rest.
         return np.minimum(-np.log(siemens), prior.expected)

@@ -51,9 +51,7 @@ column has (Z_ii - Z_jj) / 2. So in sum over all lines, where row and column can
     q = I N / (N - 2) (w_j - w_i) ,  w_l = Z_ll - 2 (mean of Z_lk over all k) .
 
 Z is that of cells without wires. They are not known yet, but from the conductances of the ports,
-G = 1 / (1 / I - R_s), nearly: of each, paths around the cell have a part. They lead through the
-other cells of the row, and then those of the column. With G_row and G_column the sums of the other
-G of both, and P = G_row G_column / (G_row + G_column), a cell is taken for G^2 / (G + P).
+1 / (1 / I - R_s), nearly (`cells_of_ports`).
 
 **Far ends.** Nothing draws current from a far end. So its potential differs from that of the near
 end by what the wires of the line lose, and
@@ -82,7 +80,7 @@ from ohmskin.circuit.configurations import (
     node_ratio,
     reference_ohm,
 )
-from ohmskin.circuit.ports import solve_ports
+from ohmskin.circuit.ports import cells_of_ports, solve_ports
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinKnowledge
 
 # Largest offset of a sense node that is believed, over Vdd. A larger one stays in the residuals and
@@ -127,9 +125,7 @@ def row_share(current: Float, ref_ohm: float) -> Float:
     # Noise may make currents negative.
     port_ohm = 1.0 / np.maximum(current, MIN_CELL_SIEMENS) - ref_ohm
     port = 1.0 / np.clip(port_ohm, 1.0 / MAX_CELL_SIEMENS, 1.0 / MIN_CELL_SIEMENS)
-    by_row, by_column = (port.sum(axis=axis, keepdims=True) - port for axis in (1, 0))
-    around = by_row * by_column / np.maximum(by_row + by_column, MIN_CELL_SIEMENS)
-    _, impedance = solve_ports(port * port / (port + around))
+    _, impedance = solve_ports(cells_of_ports(port))
     rows, lines = len(current), len(impedance)
     away = impedance.diagonal() - 2.0 * impedance.mean(axis=0)
     share = lines / max(lines - 2, 1) * current * (away[rows:] - away[:rows, None])
