@@ -249,10 +249,10 @@ class PortCircuit:
         currents i j is at most the mean of their squares.
         """
         by_port = weight.reshape(self.shape)
-        of_lines = np.concatenate([by_port.max(axis=1), by_port.max(axis=0)])
+        heaviest = np.concatenate([by_port.max(axis=1), by_port.max(axis=0)])  # of each line
         square = np.zeros(2 * by_port.size)
         for current in (self._wire_current, self._wire_sense_current):
-            each = of_lines[:, None] * _of_lines(current) ** 2
+            each = heaviest[:, None] * _of_lines(current) ** 2
             square += each[: self.rows].max(axis=0) + each[self.rows :].max(axis=0)
         return self.segment_ohm * square
 

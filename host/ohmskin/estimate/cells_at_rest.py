@@ -50,7 +50,8 @@ LEAK_STD: Final = 0.2
 # The untouched skin is solved again if the mean lead has moved by more. Chosen: less moves readings
 # by less than their rounding.
 LEAD_MOVE_OHM: Final = 20.0
-# Slopes of cells at rest hold until the logs of cells err by this share of `REST_STD`.
+# Slopes of cells at rest hold until logs of cells err by this share of `REST_STD`. Chosen: a tenth
+# of what cells drift.
 BENT_SHARE: Final = 0.1
 # Single segments are learned if a line resists more than this from end to end [ohm], on skins of
 # at most so many cells. Chosen: with shorter lines it gains nothing, and larger skins take long.
