@@ -25,6 +25,7 @@ from ohmskin.circuit.configurations import (
 from ohmskin.estimate.prior import (
     LAYER_STD,
     LEAD_STD,
+    SEGMENT_STD,
     UNKNOWN_LEAD_OHM,
     UNKNOWN_WIRE_OHM,
     USUAL_LEAD_STD_OHM,
@@ -147,15 +148,14 @@ class WireOhm(NamedTuple):
         odds *= math.exp(0.5 * change_ohm**2 * (1 / bent - 1 / still))
         return told * (odds / still + 1 / bent) / (odds + 1)
 
-    def of_curves(
-        self, now: tuple[float, float, float], lead_std_ohm: float = 0.0
-    ) -> tuple[float, float, float]:
+    def of_curves(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
         """The wires that levels are computed with, if top, bottom and lead are these now [ohm].
 
         A press alone shows a cell and the wires up to it as one. So what wires were told wrongly by
         is in the curves of cells. What the skin was stretched by since is not. A lead does not
-        stretch. But frames, which know it to `lead_std_ohm` now, may take for lead some of what
-        layers have changed by. Against that, a measured lead was told wrongly by its own deviation.
+        stretch, but frames take for lead some of what layers have changed by, or single segments
+        differ by: no more than that, and in the same direction. Against that, a measured lead was
+        told wrongly by its own deviation.
         """
         pairs = []
         for told, curve, ohm in zip(self[:2], self[6:8], now, strict=False):
@@ -167,17 +167,20 @@ class WireOhm(NamedTuple):
         top, bottom = (curve * (ohm / told_ohm) ** left for told_ohm, curve, ohm in pairs)
         told_ohm, _ = self.lead_or_usual(0.0)
         curve_ohm = told_ohm if self.curve_lead is None else self.curve_lead
-        lead_left = 1.0 - self.told_share
+        lead_left, lead_change_ohm = 1.0 - self.told_share, now[2] - told_ohm
         if self.both and self.lead_std_ohm:
-            lead_left = left * lead_std_ohm**2 / (lead_std_ohm**2 + self.lead_std_ohm**2)
-        return top, bottom, max(curve_ohm + lead_left * (now[2] - told_ohm), 0.0)
+            own_ohm = SEGMENT_STD * sum(self.both)
+            of_layers = change_ohm**2 + own_ohm**2
+            lead_left = left * of_layers / (of_layers + self.lead_std_ohm**2)
+            lead_change_ohm = max(lead_change_ohm, min(change_ohm, 0.0) - own_ohm)
+            lead_change_ohm = min(lead_change_ohm, max(change_ohm, 0.0) + own_ohm)
+        return top, bottom, max(curve_ohm + lead_left * lead_change_ohm, 0.0)
 
     def for_curves_of(self, before: "WireOhm") -> "WireOhm":
         """These wires, which were learned later, for curves of presses that were told `before`."""
         if self is before or self.both is None or before.both is None:
             return self
-        now_ohm, now_std_ohm = self.lead_or_usual(0.0)
-        top, bottom, lead = before.of_curves((*self.both, now_ohm), now_std_ohm)
+        top, bottom, lead = before.of_curves((*self.both, self.lead_or_usual(0.0)[0]))
         return self._replace(curve_top=top, curve_bottom=bottom, curve_lead=lead)
 
     @property

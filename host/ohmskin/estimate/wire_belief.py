@@ -505,8 +505,7 @@ class WireBelief(ABC):
         leads = np.maximum(wires[segments.size :], 0.0)
         path_ohm = self._path_ohm(segments, leads)
         top_ohm, bottom_ohm = np.exp(means[:2]).tolist()
-        lead_std_ohm = float(self._state.means_std[2])
-        curve_ohm = self.told.of_curves((top_ohm, bottom_ohm, float(means[2])), lead_std_ohm)
+        curve_ohm = self.told.of_curves((top_ohm, bottom_ohm, float(means[2])))
         hidden_ohm = path_ohm - curve_ohm @ self._wires_of_paths
         return SkinWires(segments, segments * self.segment_std(), path_ohm, hidden_ohm)
 
