@@ -60,8 +60,8 @@ PALM_TIMES: Final = 10.0
 # wire must not be neglected, and it may hide touches behind it. Chosen: 8 segments of 3 kOhm. From
 # there on, a fit that starts at rest takes fewer steps.
 LONG_LINE_OHM: Final = 24e3
-# Where a fit starts from what `matrix` finds, that ends below this chi-square per port. Chosen: one
-# step is enough, and with less the answers are the same.
+# Where a fit starts from cells of `matrix`, `matrix` ends below this chi-square per port. Chosen:
+# one step is enough, and with less the answers are the same.
 START_CHI2: Final = 4.0
 # Why such a frame is no answer.
 BEYOND_REGION: Final = "something has changed outside of the region: read the whole skin"

@@ -186,8 +186,8 @@ class CellFit:
         port = conductance_from_current(self._target, self._ref_ohm).reshape(self._shape)
         cell = cells_of_ports(port)
         for _ in range(CORRECTIONS):
-            by = np.clip(port * solve_ports(cell)[0], 1 / MOST_CORRECTION, MOST_CORRECTION)
-            cell = np.clip(by * cell, MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
+            factor = np.clip(port * solve_ports(cell)[0], 1 / MOST_CORRECTION, MOST_CORRECTION)
+            cell = np.clip(factor * cell, MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
         return self._try(cell)
 
     def _try(self, cell: Float) -> Trial:
