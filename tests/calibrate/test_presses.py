@@ -80,6 +80,23 @@ def test_a_flicker_does_not_divide_a_press_and_a_bounce_is_none() -> None:
     )
 
 
+def test_a_slow_board_sees_short_presses_and_the_pauses_between_them() -> None:
+    """At 5 scans/s, a press of 0.8 s has four scans; after a pause of 0.4 s comes the next one.
+
+    Noise of an untouched cell is no second press, however little the pressed cell shows.
+    """
+    times_s = np.arange(60) / 5
+    force_n = np.zeros((60, 1, 2))
+    for begin in range(10, 58, 6):
+        force_n[begin : begin + 4, 0, begin // 6 % 2] = [0.5, 2.0, 3.0, 1.0]
+    noise = 1e-6 * np.random.default_rng(3).standard_normal(force_n.shape)
+    seen = LevelHistory(times_s, 20e-6 * force_n + noise, np.full_like(noise, 1e-6), force_n > 0)
+    found = find_presses(seen, ForceLog(times_s - OFFSET_S, force_n.sum(axis=(1, 2))), OFFSET_S)
+    np.testing.assert_array_equal(found.counts, [[4, 4]])
+    assert found.shared == 0
+    assert found.cells.size == 32
+
+
 def test_presses_in_quick_succession_are_several() -> None:
     """Creep keeps the cell touched in between, noise makes it flutter."""
     random = np.random.default_rng(4)
@@ -100,7 +117,7 @@ def test_presses_in_quick_succession_are_several() -> None:
 )
 def test_a_maximum_that_repeats_exactly_is_one_press(rise: list[float], numbers: list[int]) -> None:
     """As where readings are whole steps of a converter. Deep valleys divide presses as ever."""
-    found = number_presses(np.zeros(len(rise), np.intp), np.array(rise))
+    found = number_presses(np.zeros(len(rise), np.intp), np.array(rise), 1 / HZ)
     np.testing.assert_array_equal(found, numbers)
 
 

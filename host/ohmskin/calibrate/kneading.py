@@ -34,7 +34,7 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.kneaded_wires import Shown, WireSearch, held
-from ohmskin.calibrate.presses import Calibrator, Progress, number_presses
+from ohmskin.calibrate.presses import Calibrator, Progress, number_presses, scan_period_s
 from ohmskin.calibrate.tables import ForceLog, gaps
 from ohmskin.calibrate.totals import TotalFit, Totals, check_weighed
 from ohmskin.circuit.ports import PortCircuit
@@ -115,7 +115,8 @@ class Kneading:
         self._weighed: Bool | None = None  # scans whose force is known, if the scale does not lag
         self.of_skin: Float = np.sum(rise, axis=1, where=rises)
         is_pressed = rises.any(axis=1)
-        self._press = number_presses(np.where(is_pressed, 0, -1), self.of_skin)
+        scan_s = scan_period_s(self.time_s)
+        self._press = number_presses(np.where(is_pressed, 0, -1), self.of_skin, scan_s)
         self._is_clear = (self._press >= 0) | ~is_pressed  # a press that is too short is neither
 
     def learn(self, log: ForceLog, progress: Progress = iter, *, lags: bool = True) -> TotalFit:

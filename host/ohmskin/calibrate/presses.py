@@ -2,11 +2,12 @@
 """From presses of single cells, in scans or in a table, to the calibration of a skin.
 
 A scan belongs to the cell that rises most above rest, if that cell is touched. Consecutive scans of
-one cell are a press, if there are `MIN_PRESS_SCANS` at least. Where the rise falls to a fifth in
-between, they are several presses. Scans in which another cell rises by more than `SECOND_SHARE` of
-the first are left out, because nothing tells how two cells share a force.
+one cell are a press, if they take `MIN_PRESS_S` at least. Where the rise falls to a fifth in
+between, they are several presses. Scans in which another touched cell rises by more than
+`SECOND_SHARE` of the first are left out, because nothing tells how two cells share a force.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -32,11 +33,11 @@ from ohmskin.force.reader import DEFAULT_METHOD, now, touched_cells
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Hello, Scan
 
-# So many scans without touch may interrupt a press. Chosen: a light touch flickers about its
-# threshold, and nobody lifts a finger for less than 30 ms.
-FLICKER_SCANS: Final = 3
-# Fewer scans in a row are a bounce, not a press. Chosen: 50 ms at 90 Hz.
-MIN_PRESS_SCANS: Final = 5
+# Scans without touch may interrupt a press for so long [s]. Chosen: a light touch flickers about
+# its threshold, and nobody lifts a finger for less.
+FLICKER_S: Final = 0.035
+# A shorter press is a bounce [s], and so are fewer scans. Chosen: one scan may be noise.
+MIN_PRESS_S, MIN_PRESS_SCANS = 0.05, 2
 # A cell that rises by more than this share of the strongest one is pressed, too. Chosen: what the
 # estimate leaves in the neighbours of one pressed cell is less.
 SECOND_SHARE: Final = 0.25
@@ -133,14 +134,15 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
     enough = np.count_nonzero(untouched) >= MIN_ZERO_SCANS
     zero_n = float(np.median(force_n[untouched])) if enough else 0.0
 
-    rise = history.rise.reshape(scans, -1)
-    pressed = _pressed(rise, history.touched.reshape(scans, -1))
+    rise, touched = history.rise.reshape(scans, -1), history.touched.reshape(scans, -1)
+    scan_s = scan_period_s(history.time_s)
+    pressed = _pressed(rise, touched, int(FLICKER_S / scan_s))
     # Where no cell is pressed, `_NOTHING` is the index of the last cell. Such scans get its rise,
     # but they are of no press, and so are left out below.
     every = np.arange(scans)
     pressed_rise = rise[every, pressed]
-    press = number_presses(pressed, pressed_rise)
-    others = rise.copy()
+    press = number_presses(pressed, pressed_rise, scan_s)
+    others = np.where(touched, rise, -np.inf)
     others[every, pressed] = -np.inf
     shared = (press != _NOTHING) & (others.max(axis=1) > SECOND_SHARE * pressed_rise)
     good = (press != _NOTHING) & ~shared & has_force
@@ -160,10 +162,15 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
     )
 
 
-def _pressed(rise: Float, touched: Bool) -> NDArray[np.intp]:
+def scan_period_s(time_s: Float) -> float:
+    """Time from one scan to the next [s], by the times of n scans. No board scans in 0.1 ms."""
+    return max(float(np.median(np.diff(time_s))), 1e-4) if time_s.size > 1 else MIN_PRESS_S
+
+
+def _pressed(rise: Float, touched: Bool, flicker: int) -> NDArray[np.intp]:
     """Index of the cell that each scan belongs to, or `_NOTHING`. Arrays (n, R * C).
 
-    Scans between two of one cell belong to it as well, if they are `FLICKER_SCANS` at most.
+    Scans between two of one cell belong to it as well, if they are so many at most: `flicker`.
     """
     from scipy.ndimage import binary_closing
 
@@ -173,25 +180,29 @@ def _pressed(rise: Float, touched: Bool) -> NDArray[np.intp]:
         of_cell = (strongest == cell) & touched[:, cell]
         # Closing fills gaps shorter than its structure. Without the padding, it would empty the
         # first and last scans.
-        padded = np.pad(of_cell, FLICKER_SCANS + 1)
-        closed = binary_closing(padded, np.ones(FLICKER_SCANS + 1))
+        padded = np.pad(of_cell, flicker + 1)
+        closed = binary_closing(padded, np.ones(flicker + 1))
         # Scans of a gap that show another cell stay that cell's, whichever of them comes first.
-        pressed[closed[FLICKER_SCANS + 1 : -FLICKER_SCANS - 1] & (pressed == _NOTHING)] = cell
+        pressed[closed[flicker + 1 : -flicker - 1] & (pressed == _NOTHING)] = cell
         pressed[of_cell] = cell
     return pressed
 
 
-def number_presses(pressed: NDArray[np.intp], pressed_rise: Float) -> NDArray[np.intp]:
+def number_presses(
+    pressed: NDArray[np.intp], pressed_rise: Float, scan_s: float
+) -> NDArray[np.intp]:
     """Number of the press that each scan is of, or `_NOTHING`.
 
     pressed: index of the cell that is pressed in each scan, or `_NOTHING`, (n,).
     pressed_rise: the rise of that cell, (n,).
+    scan_s: time from one scan to the next.
     """
+    least = max(MIN_PRESS_SCANS, math.ceil(MIN_PRESS_S / scan_s))
     press = np.full(pressed.size, _NOTHING, dtype=np.intp)
     number = 0
     changes = np.flatnonzero(np.diff(pressed)) + 1
     for run in np.split(np.arange(pressed.size), changes):
-        if pressed[run[0]] == _NOTHING or run.size < MIN_PRESS_SCANS:
+        if pressed[run[0]] == _NOTHING or run.size < least:
             continue
         for part in np.split(run, _valleys(pressed_rise[run])):
             press[part] = number

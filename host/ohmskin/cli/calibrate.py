@@ -544,6 +544,8 @@ def _wires_in_words(calibration: Calibration, calibrator: Calibrator) -> str:
         ends = {"top": f"columns 0 and {calibration.columns - 1}"}
         ends["bottom"] = f"rows 0 and {calibration.rows - 1}"
         line += f"\npresses tell little of the wires of the {' and '.join(found.unclear)} layer: "
-        line += f"press {', '.join(ends[layer] for layer in found.unclear)} hard"
-        line += " or tell --leads" if lead_ohm is None else ""
+        told = (("--wires", found.told.both), ("--leads", lead_ohm))
+        remedies = [f"press {', '.join(ends[layer] for layer in found.unclear)} harder"]
+        remedies += [f"tell {option}" for option, value in told if value is None]
+        line += " or ".join(remedies)
     return line
