@@ -156,7 +156,7 @@ def test_a_region_that_a_program_has_left_is_said_and_can_be_ended(
     said = re.search(r"([\d.]+) Hz between whole scans, ([\d.]+) Hz with them", page)
     assert said
     assert list(map(float, said.groups())) == pytest.approx([rate_hz, made_hz], rel=1e-3)
-    told = "not all cells are scanned: 'ohmskin configure PORT --rows 4 --columns 6' changes that"
+    told = "'ohmskin configure PORT --rows 4 --columns 6 --save' changes that"
     assert told in page
     for method in ("none", "joint"):  # it showed 0.0 where nothing was read
         assert told in well(run("stream", path, "--method", method, "--scans", "1")).out
@@ -170,7 +170,7 @@ def test_a_region_that_a_program_has_left_is_said_and_can_be_ended(
         pytest.raises(ValueError, match="of a region") as no,
     ):
         check_complete(skin.info)
-    assert "'ohmskin configure PORT --mode near --rows 4 --columns 6'" in str(no.value)
+    assert "'ohmskin configure PORT --mode near --rows 4 --columns 6 --save'" in str(no.value)
     well(run("configure", path, "--mode", "near", "--rows", "4", "--columns", "6"))
     assert "all cells" in well(run("info", path)).out
     with ohmskin.open(path, start=False) as skin:

@@ -151,3 +151,32 @@ def test_tare_is_refused_while_something_touches_the_skin(run: Run, skin: Path) 
     assert skin.read_bytes() == before
     assert run(*arguments, "--force").code == 0
     assert load_calibration(skin).tare is not None
+
+
+@pytest.mark.parametrize("command", ["stream", "record"])
+def test_a_rest_with_touches_in_it_is_said(run: Run, tmp_path: Path, command: str) -> None:
+    """It made the touched cells show too little, and nobody said so before the calibration."""
+    of = ("--tare", "0.3", "--seconds", "0.5")
+
+    def said(scene: str) -> str:
+        out = [str(tmp_path / f"{scene}.mcap")] if command == "record" else []
+        done = run(command, f"emulator://6x6?scene={scene}", *out, *of)
+        assert done.code == 0
+        return done.err
+
+    touched = "cells (1, 1), (1, 4), (4, 1) are touched at rest: if something is on the skin"
+    assert said("ghost&begin=0").startswith(touched)
+    assert said("single&begin=9") == ""
+
+
+def test_presses_in_a_mode_that_no_calibration_takes_are_said_at_once(
+    run: Run, tmp_path: Path
+) -> None:
+    """Else a robot had pressed all cells before."""
+    of = ("--force-port", "truth", "--tare", "0.1", "--seconds", "0.3")
+    half, near = (
+        well(run("record", f"emulator://3x3?scene=presses&mode={mode}&speed=0", str(out), *of)).out
+        for mode, out in (("half", tmp_path / "half.mcap"), ("near", tmp_path / "near.mcap"))
+    )
+    assert "no calibration learns from this recording: a skin is calibrated in" in half
+    assert "no calibration" not in near

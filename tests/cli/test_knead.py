@@ -304,7 +304,8 @@ def test_a_board_that_cannot_be_kneaded_says_so_at_once(run: Run, tmp_path: Path
     knead, out = ("calibrate", "knead"), str(tmp_path / "skin.json")
     done = run(*knead, f"{SKIN}&scene=knead&mode=half", out, *TRUTH)
     assert_one_line(
-        done, "all of it, and this board is in mode half: 'ohmskin configure PORT --mode near'"
+        done,
+        "all of it, and this board is in mode half: 'ohmskin configure PORT --mode near --save'",
     )
     well(run(*knead, f"{SKIN}&scene=knead", out, *TRUTH, "--seconds", "11"))
     done = run(*knead, f"{SKIN}&scene=knead&mode=far", out, *TRUTH)

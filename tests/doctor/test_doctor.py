@@ -192,7 +192,7 @@ def test_lines_that_are_not_there_are_one_finding() -> None:
     bench.configure(rows=7, rate_hz=0)
     [finding] = examine(gather(bench)).findings
     assert (finding.kind, finding.place) == (Kind.OPEN_ROW, Place(rows=(4, 5, 6)))
-    assert "'ohmskin configure PORT --rows 4'" in words_of(finding)["what_to_do"]
+    assert "'ohmskin configure PORT --rows 4 --save'" in words_of(finding)["what_to_do"]
 
 
 # ----------------------------------------------------------------------- hum, noise, settling

@@ -22,14 +22,14 @@ from ohmskin.calibrate.rules import check_cell, check_cells_differ, check_comple
 from ohmskin.calibrate.tables import ForceLog, PressTable
 from ohmskin.calibrate.wires import FoundWires, PressReadings, find_wires
 from ohmskin.errors import TareRefused
-from ohmskin.estimate.base import TOUCH_SIEMENS, TOUCH_STDS, Estimator
+from ohmskin.estimate.base import TOUCH_STDS, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.curve import ForceModel
-from ohmskin.force.reader import DEFAULT_METHOD, now, touched_cells
+from ohmskin.force.reader import now, touched_at_rest, touched_cells
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Hello, Scan
 
@@ -50,12 +50,6 @@ VALLEY_LOG: Final = np.log(5.0)
 # What rises by less than this share of the strongest rise is noise, whose logarithm would have
 # valleys without end. Chosen: far below what a light touch shows.
 _NOISE_SHARE: Final = 1e-3
-# At least this share of the cells is taken to be untouched at rest. Chosen: so three touched cells
-# of four are found.
-UNTOUCHED_SHARE: Final = 0.25
-# A cell that conducts more than untouched ones by this factor at rest is touched. Chosen: untouched
-# cells scatter by tens of percent, and a touch of 100 kOhm is a factor of eleven.
-TOUCHED_TIMES: Final = 8.0
 # A cell that has lost more than this share of its rest in the later scans was touched at rest.
 # Chosen: no rest drifts by as much in a session.
 LOST_SHARE: Final = 0.5
@@ -249,10 +243,8 @@ class Calibrator:
     rest_level: what the estimator shows of the untouched skin, (R, C) [S, or 1 for `voltage`].
     found: the wires by presses; None before `learn_wires`.
 
-    There is no earlier rest to compare with. So a cell counts as touched at rest if it conducts far
-    more than most others: g > `TOUCHED_TIMES` max(quantile of g, 0.5e-6 S), a limit that wires and
-    the scatter of cells do not reach. It also counts as touched at rest if its level is lower in
-    later scans, by more than `LOST_SHARE` of rest.
+    Cells count as touched at rest by `touched_at_rest`, or if their level is lower in later scans,
+    by more than `LOST_SHARE` of rest.
 
     :raises TareRefused: something touched the skin while its rest was measured.
     """
@@ -268,11 +260,7 @@ class Calibrator:
         check_complete(self.board)
         self.found: FoundWires | None = None
         self._tell(self.nominal_wire_ohm)
-        at_rest = make_estimator(DEFAULT_METHOD, self.knowledge).rest()
-        assert at_rest is not None  # the readings are known
-        siemens = at_rest.cell_siemens
-        untouched = float(np.quantile(siemens, UNTOUCHED_SHARE, method="lower"))
-        self._refuse(siemens > TOUCHED_TIMES * max(untouched, TOUCH_SIEMENS))
+        self._refuse(touched_at_rest(self.knowledge))
 
     def _tell(self, wires: WireOhm) -> None:
         """Make the estimator, which knows these wires.

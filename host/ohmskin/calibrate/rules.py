@@ -37,7 +37,7 @@ def check_complete(board: Hello) -> None:
         raise ValueError(
             "a skin is calibrated in mode near or far, all of it, and this board is in mode "
             f"{board.mode}{', of a region' if region else ''}: "
-            f"'ohmskin configure PORT --mode {mode}{region}'"
+            f"'ohmskin configure PORT --mode {mode}{region} --save'"
         )
 
 

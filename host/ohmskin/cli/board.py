@@ -20,11 +20,13 @@ from rich.text import Text
 from typer import Argument, Option
 
 import ohmskin
+from ohmskin.arrays import Float
 from ohmskin.cli import pico
 from ohmskin.cli.terminal import Terminal
 from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
-from ohmskin.estimate.knowledge import WireOhm
+from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
+from ohmskin.force.reader import touched_at_rest, touched_cells
 from ohmskin.link.device import SILENCE_TIMEOUT_S, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS, MODES, lines_of
@@ -64,6 +66,14 @@ Seconds = Annotated[float, Option(min=0, help="stop after so long; 0: never")]
 def asked_for(scans: Iterable[Scan], count: int, seconds: float) -> Iterator[Scan]:
     """The scans that the options `Scans` and `Seconds` ask for."""
     return islice(scans_for(scans, seconds or math.inf), min(count, sys.maxsize) or None)
+
+
+def warn_of_touched(board: Hello, rest_ratio: Float) -> None:
+    """Say which cells seem touched in what was measured as the rest, (R, C, 4), if any do."""
+    touched = touched_at_rest(SkinKnowledge.of(board, rest_ratio))
+    if touched.any():
+        text = f"{touched_cells(touched)} at rest: if something is on the skin, take it off, and"
+        print(f"{text} begin anew", file=sys.stderr)  # noqa: T201
 
 
 def wires_of(text: str, lead_ohm: float | None) -> WireOhm:
@@ -132,7 +142,7 @@ def of_a_region(board: Hello) -> str:
         options += " --mode near"
     if board.rate_asked_mhz > 1000 * DEFAULT_RATE_HZ:
         options += " --rate 0"
-    return f"not all cells are scanned: 'ohmskin configure PORT {options}' changes that"
+    return f"not all cells are scanned: 'ohmskin configure PORT {options} --save' changes that"
 
 
 def _board_in_words(board: Hello) -> dict[str, str]:

@@ -547,5 +547,5 @@ def _wires_in_words(calibration: Calibration, calibrator: Calibrator) -> str:
         told = (("--wires", found.told.both), ("--leads", lead_ohm))
         remedies = [f"press {', '.join(ends[layer] for layer in found.unclear)} harder"]
         remedies += [f"tell {option}" for option, value in told if value is None]
-        line += " or ".join(remedies)
+        line += ", or ".join(remedies)
     return line

@@ -19,7 +19,7 @@ MOST_CELLS: Final = 6
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
-_WIDE: Final = "not known: press with something smaller than a cell, further apart; tell --leads"
+_WIDE: Final = "not known: tell --leads, or press with what is smaller than a cell, further apart"
 
 
 def words_of(finding: Finding) -> dict[str, str]:

@@ -22,7 +22,16 @@ from typer import Argument, Option
 
 import ohmskin
 from ohmskin.calibrate.guide import OnSkin, pressed_cells
-from ohmskin.cli.board import REF_STD, TERMINAL, Port, Scans, Seconds, asked_for
+from ohmskin.calibrate.rules import check_complete
+from ohmskin.cli.board import (
+    REF_STD,
+    TERMINAL,
+    Port,
+    Scans,
+    Seconds,
+    asked_for,
+    warn_of_touched,
+)
 from ohmskin.cli.stream import DISPLAY_EVERY_S, cell_table
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_in_time, until_ctrl_c
@@ -99,6 +108,11 @@ def record(
         sensor = sensor_at(skin, force_port, *of_sensor) if force_port else None
         if sensor is not None:
             stack.enter_context(sensor).wait()
+        if force_port:
+            try:
+                check_complete(skin.info)
+            except ValueError as exc:
+                TERMINAL.print(f"no calibration learns from this recording: {exc}")
         recorder = stack.enter_context(Recorder(file, skin.info, lambda: skin.now_s))
         for text in mark or ():
             recorder.add(Mark(text, recorder.now_s()))
@@ -120,7 +134,7 @@ def record(
             # A thread, because the end of the recording must not wait for a line.
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
-            given = asked_for(until_ctrl_c(skin), scans, seconds)
+            given = _watched(asked_for(until_ctrl_c(skin), scans, seconds), recorder)
             if force_port == TRUTH:
                 given = with_truth(given, skin, recorder)
             recording.record(skin, recorder, given, tare_s=tare_s, sensor=sensor, beside=look)
@@ -130,6 +144,16 @@ def record(
     if force_port:
         done += f", {recorder.forces} forces"
     TERMINAL.print(f"{file}: {done}{unread(sensor)}")
+
+
+def _watched(scans: Iterable[Scan], recorder: Recorder) -> Iterator[Scan]:
+    """Pass scans on, and warn once of cells that seem touched in the tare."""
+    seen = recorder.tare
+    for scan in scans:
+        if recorder.tare is not None and recorder.tare is not seen:
+            seen = recorder.tare
+            warn_of_touched(recorder.board, seen.rest_ratio)
+        yield scan
 
 
 def unread(sensor: ForceSensor | None) -> str:

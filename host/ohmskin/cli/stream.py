@@ -19,7 +19,15 @@ from typer import Option
 
 import ohmskin
 from ohmskin.arrays import FULL_SCALE_N, FULL_SCALE_USIEMENS, Float, numbers, shades
-from ohmskin.cli.board import REF_STD, Port, Scans, Seconds, asked_for, of_a_region
+from ohmskin.cli.board import (
+    REF_STD,
+    Port,
+    Scans,
+    Seconds,
+    asked_for,
+    of_a_region,
+    warn_of_touched,
+)
 from ohmskin.cli.terminal import Terminal
 from ohmskin.ctrl_c import ends_by_ctrl_c, ends_in_time
 from ohmskin.estimate.base import ASSUMED, ASSUMED_WIRES
@@ -88,7 +96,10 @@ def stream(
             skin.only_unit = None if loaded is None else skin.info.unit_id
             if tare_s:
                 # Without a calibration the rest is unknown, and cells may seem touched.
-                reader.tare(skin.mean_ratio(tare_s), force=loaded is None)
+                rest_ratio = skin.mean_ratio(tare_s)
+                reader.tare(rest_ratio, force=loaded is None)
+                if loaded is None:
+                    warn_of_touched(skin.info, rest_ratio)
             if focus:
                 reader.focus = stack.enter_context(reader.focus_on(skin))
         with ends_by_ctrl_c(), ends_in_time(_out.show_cursor):

@@ -151,7 +151,7 @@ class Estimator(ABC):
             raise ValueError(
                 f"'{self.name}' takes the readings {' '.join(NEAR)}, not "
                 f"{' '.join(knowledge.reading_names)}: use 'joint' or 'touch', or scan with "
-                "'ohmskin configure PORT --mode near'"
+                "'ohmskin configure PORT --mode near --save'"
             )
         self.knowledge = knowledge
         self._reader = PortReader(knowledge)

@@ -202,7 +202,9 @@ class Calibration:
             remedy = f"calibrate this skin, or {told} if it is that one"
             raise ValueError(f"this calibration is of a {sizes}: {remedy}")
         if board.mode != self.mode and not is_near((*MODES[board.mode], *MODES[self.mode])):
-            remedy = f"'ohmskin configure PORT --mode {self.mode}', or calibrate this skin anew"
+            remedy = (
+                f"'ohmskin configure PORT --mode {self.mode} --save', or calibrate this skin anew"
+            )
             raise ValueError(f"this calibration is of mode {self.mode}, not {board.mode}: {remedy}")
         if board.unit_id != self.unit_id and not force:
             units = f"unit {self.unit_id}, the board is unit {board.unit_id}"

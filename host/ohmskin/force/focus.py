@@ -77,7 +77,9 @@ class Focus(Closing):
         if (like.rows, like.columns, like.whole_every) != (None, None, 0):
             raise ValueError("rows, columns and whole_every follow the contacts: leave them out")
         if device.info.reads_far:
-            raise ValueError("only near ends can be followed: 'ohmskin configure PORT --mode near'")
+            raise ValueError(
+                "only near ends can be followed: 'ohmskin configure PORT --mode near --save'"
+            )
         for mode in (like.mode, like.whole_mode):
             if mode not in MODES or not is_near(MODES[mode]):
                 raise ValueError(f"contacts are followed in mode near, half or quick, not {mode}")

@@ -249,7 +249,7 @@ class ViewedBoard(LiveSkin):
                 return reader
             note = (
                 f"no forces: '{reader.method}' takes whole scans, the board scans in mode "
-                f"{board.mode}: 'ohmskin configure PORT --mode near'"
+                f"{board.mode}: 'ohmskin configure PORT --mode near --save'"
             )
         self._note = note
         return SkinReader(board)
