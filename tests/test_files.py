@@ -5,6 +5,7 @@ import errno
 import os
 import time
 from collections.abc import Callable
+from contextvars import copy_context
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,27 @@ def test_what_a_killed_program_left_hinders_no_other(tmp_path: Path) -> None:
     save_bytes(tmp_path / "file")
     assert (tmp_path / "file").read_bytes() == b"new"
     assert {each.name for each in tmp_path.iterdir()} == {"file", young.name, foreign.name}
+
+
+def test_a_partial_file_of_a_run_that_was_ended_replaces_nothing(tmp_path: Path) -> None:
+    """A process elsewhere may go on with it. Those of other runs stay."""
+    path, other = tmp_path / "file", tmp_path / "other"
+    path.write_text("old")
+    in_run = copy_context()
+    in_run.run(files.RUN.set, "1a")
+
+    def ended() -> None:
+        with files.whole_file(path) as file, files.whole_file(other):
+            file.write(b"new")
+            files.remove_parts("1b", [path])
+            assert len(list(tmp_path.glob("*.part"))) == 3
+            files.remove_parts("1a", [path])
+
+    failure = pytest.raises(ValueError, match="cannot be written: No such file")
+    with files.whole_file(tmp_path / "third"), failure:
+        in_run.run(ended)
+    assert {each.name for each in tmp_path.iterdir()} == {"file", "third"}
+    assert path.read_text() == "old"
 
 
 def test_a_name_may_be_as_long_as_the_system_takes(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from io import TextIOWrapper
 from pathlib import Path
 from secrets import token_hex
@@ -19,6 +20,8 @@ PathName = str | os.PathLike[str]
 # A partial file that is so old [s] was left by a program that was killed. Chosen: an hour, which no
 # file of ours takes to write.
 _LEFT_S: Final = 3600.0
+# The names of partial files begin so where it is set: `remove_parts` of the same run finds them.
+RUN: Final = ContextVar("run", default="")
 
 
 @contextmanager
@@ -95,7 +98,7 @@ def whole_file(path: PathName) -> Iterator[BinaryIO]:
     `_LEFT_S`. Raises ValueError, naming the path, if it cannot be written, or is no file.
     """
     target = Path(os.path.realpath(path))
-    partial = target.with_name(f".ohmskin-{token_hex(8)}.part")  # short, whatever the file's name
+    partial = target.with_name(f".ohmskin-{RUN.get()}{token_hex(8)}.part")  # a short name
     try:
         for left in target.parent.glob(".ohmskin-*.part"):
             with suppress(FileNotFoundError):  # another program has removed it
@@ -115,6 +118,17 @@ def whole_file(path: PathName) -> Iterator[BinaryIO]:
             partial.unlink(missing_ok=True)
     except OSError as error:
         raise ValueError(f"{target}: cannot be written: {error.strerror or error}") from error
+
+
+def remove_parts(run: str, paths: Iterable[PathName]) -> None:
+    """Remove the partial files that others, for whom `RUN` was this, have left beside `paths`.
+
+    One that is still being written cannot replace its path any more: its writer raises ValueError.
+    """
+    for folder in {Path(os.path.realpath(path)).parent for path in paths}:
+        for left in folder.glob(f".ohmskin-{run}*.part"):
+            with suppress(OSError):  # its writer has removed it, or it is another user's
+                left.unlink()
 
 
 def save_table(path: PathName, names: Iterable[str], rows: Iterable[Iterable[object]]) -> None:

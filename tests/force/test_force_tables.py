@@ -6,6 +6,8 @@ import json
 import os
 import signal
 import sys
+import threading
+import time
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -25,6 +27,7 @@ from ohmskin.record.readings import load_readings
 from ohmskin.record.recorder import Recorder
 from ohmskin.record.recording import Mark
 from stepped import stepped
+from waiting import until
 
 URL = "emulator://8x8?scene=ghost&seed=1&begin=0.2"
 CELLS = ("force_n", "force_n_std")
@@ -223,12 +226,42 @@ def test_a_process_that_is_killed_is_said_in_a_line(
     pytest.importorskip("joblib")
     (again := tmp_path / "b.mcap").write_bytes(recorded.read_bytes())
 
-    def killed(*_: object, force: bool) -> None:
+    def killed(*_: object, **__: object) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
     monkeypatch.setattr(tables, "export_or_why_not", killed)
     done = run("export", str(recorded), str(again), str(tmp_path))
     assert_one_line(done, "a process that wrote one of the files was ended")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no process is killed so")
+@pytest.mark.parametrize("backend", ["loky", "dask"])
+def test_ctrl_c_leaves_no_partial_file(
+    recorded: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, backend: str
+) -> None:
+    """The processes that write them are killed: the files stayed for an hour."""
+    pytest.importorskip("joblib" if backend == "loky" else "dask.distributed")
+    (again := tmp_path / "b.mcap").write_bytes(recorded.read_bytes())
+    (out := tmp_path / "out").mkdir()
+    (out / "a.npz").write_text("old")
+
+    def stuck(*told: object, **more: object) -> object:
+        from ohmskin.force import tables  # of the process that writes
+
+        tables.Stacks.save = lambda *_: time.sleep(600)
+        return tables.export_or_why_not(*told, **more)
+
+    def interrupt() -> None:
+        until(lambda: list(out.glob(".ohmskin-*.part")), 60)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(tables, "export_or_why_not", stuck)
+    waits = threading.Thread(target=interrupt)
+    waits.start()
+    done = run("export", str(recorded), str(again), str(out), "--backend", backend)
+    waits.join()
+    assert done.code == 130
+    assert [path.read_text() for path in out.iterdir()] == ["old"]
 
 
 def test_readings_are_exported_where_the_environment_names_a_calibration(
@@ -259,7 +292,7 @@ def test_without_dask_it_says_what_to_install(
     recorded: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("joblib")
-    monkeypatch.setitem(sys.modules, "dask", None)
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
     (again := tmp_path / "b.mcap").write_bytes(recorded.read_bytes())
     done = run("export", str(recorded), str(again), str(tmp_path), "--backend", "dask")
     assert_one_line(done, "run pip install 'dask[distributed]'")

@@ -8,9 +8,10 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
+from secrets import token_hex
 from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
@@ -39,7 +40,7 @@ from ohmskin.errors import DeviceLost, OhmskinError, RecordingError
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import METHODS, make_estimator
-from ohmskin.files import check_place
+from ohmskin.files import check_place, remove_parts
 from ohmskin.force import tables
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import DEFAULT_METHOD
@@ -338,6 +339,8 @@ def _at_once(
         import joblib
 
         with ExitStack() as stack:
+            # Workers may be killed, as dask's are by Ctrl-C, or go on elsewhere. This comes last.
+            stack.callback(remove_parts, run := token_hex(8), [to for _, to in pairs])
             if backend == "dask":
                 from dask.distributed import Client
 
@@ -345,8 +348,9 @@ def _at_once(
                 stack.enter_context(Client(dashboard_address=None))
             stack.enter_context(joblib.parallel_config(backend))
             job = joblib.delayed(tables.export_or_why_not)
-            jobs = (job(*pair, *told, force=force) for pair in pairs)
-            done = joblib.Parallel(n_jobs=-1, return_as="generator")(jobs)
+            jobs = (job(*pair, *told, force=force, run=run) for pair in pairs)
+            parallel = joblib.Parallel(n_jobs=-1, return_as="generator")
+            done = stack.enter_context(closing(parallel(jobs)))  # its processes end with it
             bar = stack.enter_context(_bar())
             return list(bar.track(done, total=len(pairs), description="recordings"))
     except ImportError as exc:

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ohmskin.errors import OhmskinError
-from ohmskin.files import PathName, naming, save_table, whole_file
+from ohmskin.files import RUN, PathName, naming, save_table, whole_file
 from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
 from ohmskin.force.reader import ForceScan, SkinReader, check_mode
 from ohmskin.link.messages import Scan
@@ -123,8 +123,12 @@ def export(
     return part
 
 
-def export_or_why_not(path: Path, *told: Any, force: bool) -> Part | str:
-    """`export`, or why it failed in words: of many recordings, the others are still wanted."""
+def export_or_why_not(path: Path, *told: Any, force: bool, run: str) -> Part | str:
+    """`export`, or why it failed in words: of many recordings, the others are still wanted.
+
+    run: whoever ends this process may `remove_parts` of this run.
+    """
+    RUN.set(run)
     try:
         return export(path, *told, force=force)
     except (OhmskinError, ValueError, OSError) as exc:
