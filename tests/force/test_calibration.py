@@ -80,16 +80,16 @@ def test_the_curve_of_all_presses_has_the_hidden_wires_of_the_pressed_cells() ->
     cell_ohm = np.full((2, 3), 2000.0)
     found = replace(found, cell_siemens=1 / cell_ohm, level=1 / (cell_ohm + hidden_ohm))
     expected_ohm = np.array([[2100.0, 1950.0, 2400.0], [2300.0, 1750.0, 2100.0]])
-    level, std = of_skin.level(found)
+    (level,), (std,) = of_skin.level([found])
     np.testing.assert_allclose(1 / level, expected_ohm)
     # In ohm, the deviation of the last cell is the same.
     np.testing.assert_allclose(std / level**2, found.level_std / found.level**2)
     # Where no cell has a curve of its own, presses were of any.
     model = replace(of_skin.model, pooled=np.ones((2, 3), dtype=bool))
-    level, _ = replace(of_skin, model=model).level(found)
+    (level,), _ = replace(of_skin, model=model).level([found])
     np.testing.assert_allclose(1 / level, 2000.0 + hidden_ohm.mean())
     # `matrix` takes no wires into account.
-    np.testing.assert_array_equal(of_skin.level(replace(found, wires=""))[0], found.level)
+    np.testing.assert_array_equal(of_skin.level([replace(found, wires="")])[0][0], found.level)
 
 
 @pytest.mark.parametrize("pressed", [1, 5])

@@ -68,7 +68,7 @@ def test_a_cell_without_a_curve_of_its_own_has_the_hidden_wires_of_others() -> N
     of_skin = replace(of_skin, nominal_wire_ohm=wires, model=model)
     with ohmskin.open(GHOST, calibration=of_skin) as board:
         *_, scan = islice(board, 20)
-    level, _ = of_skin.level(scan.estimate)
+    (level,), _ = of_skin.level([scan.estimate])
     expected_n = np.maximum(level - of_skin.rest.level, 0.0) / NEWTON_SIEMENS
     np.testing.assert_allclose(scan.force_n, expected_n, atol=1e-9)
     assert np.abs(scan.estimate.level / level - 1).max() > 0.01

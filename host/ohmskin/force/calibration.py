@@ -45,7 +45,7 @@ types and shapes before anything is made of them, and their ranges when the obje
 """
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Final, Self
@@ -212,20 +212,24 @@ class Calibration:
             remedy = f"calibrate this skin, or {told} if it is that one, with a new board"
             raise ValueError(f"this calibration is of {units}: {remedy}")
 
-    def level(self, estimate: Estimate) -> tuple[Float, Float]:
-        """What the forces of a frame are read from, and its deviation, (R, C).
+    def level(self, estimates: Sequence[Estimate]) -> tuple[Float, Float]:
+        """What the forces of n frames of one method are read from, and its deviation, (n, R, C).
 
         It is `Estimate.level`, with one exception. The curve of a cell has wires in it that its
         presses do not show: the hidden ones. The curve of all presses has those of the pressed
         cells, on average. So for a cell of which presses tell next to nothing (`pooled`), the mean
         of the others takes the place of its own hidden wires; if there are no others, that of all.
         """
-        level, level_std, pooled = estimate.level, estimate.level_std, self.model.pooled
-        if not estimate.wires or not pooled.any():
+        level = np.array([estimate.level for estimate in estimates])
+        level_std = np.array([estimate.level_std for estimate in estimates])
+        pooled = self.model.pooled
+        if not estimates[0].wires or not pooled.any():
             return level, level_std
-        cell_ohm = estimate.cell_ohm
-        hidden_ohm = (1.0 / level - cell_ohm)[pooled == pooled.all()]
-        of_all = in_series(cell_ohm, float(hidden_ohm.mean()))
+        cell_ohm = np.array([estimate.cell_ohm for estimate in estimates])
+        # By `compress`, whose rows are contiguous: a mean of one frame is bit for bit that of many.
+        others = (pooled == pooled.all()).ravel()
+        hidden_ohm = np.compress(others, (1.0 / level - cell_ohm).reshape(len(level), -1), axis=1)
+        of_all = in_series(cell_ohm, hidden_ohm.mean(axis=1)[:, None, None])
         std = np.where(pooled, (of_all / level) ** 2, 1.0) * level_std
         return np.where(pooled, of_all, level), std
 

@@ -360,11 +360,16 @@ class SkinReader:
         """
         method = self._wanted
         estimated = (self._estimated(scan, method) for scan in scans)
-        estimates, *of_levels = zip(*estimated, strict=True)
-        rises, stds = map(np.array, of_levels)
-        touched = np.array([estimate.touched for estimate in estimates])
-        calibration, geometry = self._shared.calibration, None
-        if calibration is not None and self.has_forces:
+        estimates, at_rest = zip(*estimated, strict=True)
+        levels, stds, touched = (
+            np.array([getattr(estimate, name) for estimate in estimates])
+            for name in ("level", "level_std", "touched")
+        )
+        geometry, calibration = None, self._shared.calibration if self.has_forces else None
+        if calibration is not None:
+            levels, stds = calibration.level(estimates)
+        rises = np.array([*map(np.subtract, levels, at_rest)])
+        if calibration is not None:
             geometry = calibration.geometry
             forces = of_contacts = calibration.forces(rises, stds, touched)
         else:
@@ -385,8 +390,8 @@ class SkinReader:
             shown.append(ForceScan(**vars(scan) | forces_n | others))
         return shown
 
-    def _estimated(self, scan: Scan, method: str) -> tuple[Estimate, Float, Float]:
-        """The estimate by this method, its rise above rest, and the rise's deviation, (R, C)."""
+    def _estimated(self, scan: Scan, method: str) -> tuple[Estimate, Float]:
+        """The estimate by this method, and the level at rest, (R, C) or one for all cells, ()."""
         check_mode(self.board, scan.mode)
         if (scan.rows, scan.columns) != (self.board.rows, self.board.columns):
             sizes = f"{self.board.rows}x{self.board.columns} cells, now {scan.rows}x{scan.columns}"
@@ -399,11 +404,7 @@ class SkinReader:
         self._shared.hear(self._estimator)
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
         at_rest = np.median(estimate.level) if self._rest_level is None else self._rest_level
-        calibration = self._shared.calibration if method == self.force_method else None
-        level, level_std = estimate.level, estimate.level_std
-        if calibration is not None:
-            level, level_std = calibration.level(estimate)
-        return estimate, np.asarray(level - at_rest), level_std
+        return estimate, np.asarray(at_rest)
 
     def _begin(self) -> None:
         """Begin with no contact, and as if no scan had come before."""
