@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wires found from presses, against readings of the node Laplacian and two models of presses."""
 
+import re
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -78,6 +80,30 @@ def test_exact_presses_give_exact_wires(wires: tuple[float, float]) -> None:
     assert found.wires.both == pytest.approx(wires, rel=0.02, abs=6.0)
     assert found.wires.lead == pytest.approx(300.0, rel=0.05)
     assert (found.presses, found.unclear, found.disagrees) == (120, (), False)
+
+
+def open_row(of: Skin, row: int) -> Skin:
+    leads = of.lead_ohm.copy()
+    leads[row] = 1e10
+    return replace(of, lead_ohm=leads)
+
+
+def test_an_open_line_is_said_and_changes_nothing_else(tmp_path: Path) -> None:
+    """`joint` took its presses for weak ones elsewhere: forces of sound cells were 2 N off. The fit
+    of the wires did not end, and said leads of 348 ohm to 0 % where 77 were.
+    """
+    pressed = PressedSkin(Plan((100.0, 200.0), "series", 5, (6, 6)))
+    pressed.rest = open_row(pressed.rest, 2)
+    pressed.record(tmp_path / "r.mcap")
+    said = calibrate(tmp_path / "r.mcap", tmp_path / "skin.json", "joint")
+    assert "row 2 conducted nothing at rest: is it open?" in said
+    rows = [line.split()[1:] for line in said.splitlines() if re.match(r"\d +[\d-]", line)]
+    presses = [[cell.strip("()") for cell in row if cell == "-" or "(" in cell] for row in rows]
+    assert presses == [["-" if row == 2 else "5"] * 6 for row in range(6)]
+    wires = load_calibration(tmp_path / "skin.json").nominal_wire_ohm
+    assert wires.both == pytest.approx((100, 200), abs=30)
+    assert wires.lead_std_ohm is not None
+    assert wires.lead == pytest.approx(0.0, abs=3 * wires.lead_std_ohm)
 
 
 def test_leads_are_what_the_usual_contact_leaves_in_series() -> None:

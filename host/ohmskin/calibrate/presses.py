@@ -242,6 +242,7 @@ class Calibrator:
     estimator: of this method, for this skin.
     rest_level: what the estimator shows of the untouched skin, (R, C) [S, or 1 for `voltage`].
     found: the wires by presses; None before `learn_wires`.
+    fault: what is wrong with the skin at rest, such as an open line, in words; or empty.
 
     Cells count as touched at rest by `touched_at_rest`, or if their level is lower in later scans,
     by more than `LOST_SHARE` of rest.
@@ -260,6 +261,7 @@ class Calibrator:
         check_complete(self.board)
         self.found: FoundWires | None = None
         self._tell(self.nominal_wire_ohm)
+        self.fault = PortReader(self.knowledge).read(self.rest_ratio).fault
         self._refuse(touched_at_rest(self.knowledge))
 
     def _tell(self, wires: WireOhm) -> None:

@@ -119,6 +119,9 @@ ROUNDS: Final = 4
 # Newton steps for the untouched cells of a trial, which starts from those of the one before, and
 # the step that is the last.
 _REST_STEPS, _CLOSE_STEP = 20, 1e-6
+# A port that conducts less than this share of the median one at rest is of an open line. Chosen: an
+# open line leaves hundredths, and lines of 10 kOhm a segment halve a current.
+OPEN_SHARE: Final = 0.05
 # Step of p for slopes by differences.
 _DIFFERENCE: Final = 1e-3
 # p stays within this of its centre. Chosen: as a log, it is a factor of e^14, and only a fit that
@@ -293,7 +296,10 @@ class _PressFit:
         self._x = rows.log_force - rows.log_force.mean()
         self._bend = self._x**2 - np.mean(self._x**2)
         level = rest_level(rest_current.reshape(self._shape), self._ref_ohm)
+        # Cells of an open line have no slopes to speak of: to fit them would not end.
+        self._is_open = rest_current < OPEN_SHARE * np.median(rest_current)
         self._log_siemens = np.full(rest_current.size, np.log(level))
+        self._log_siemens[self._is_open] = np.log(MIN_CELL_SIEMENS)
         # It keeps more trials than one step and its slopes need.
         self._trial = lru_cache(maxsize=8)(self._solved)
         self._set_priors(knowledge.nominal_wire_ohm)
@@ -332,8 +338,10 @@ class _PressFit:
             circuit = PortCircuit(siemens, top_ohm, bottom_ohm)
             current = 1.0 / (circuit.port_ohm + series_ohm)
             slopes = (current**2 / self._rest_std)[:, None] * circuit.by_cell()
+            slopes[:, self._is_open] = 0.0
             off = (self._rest_current - current) / self._rest_std
             from_level = (log_siemens - np.median(log_siemens)) / UNTOUCHED_STD**2
+            from_level[self._is_open] = 0.0
             system = slopes.T @ slopes + np.eye(off.size) / UNTOUCHED_STD**2
             step = solve_positive(system, slopes.T @ off - from_level)
             log_siemens = log_siemens + np.clip(step, -MAX_STEP_LOG, MAX_STEP_LOG)

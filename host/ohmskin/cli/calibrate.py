@@ -241,7 +241,10 @@ def recording(
         presses = find_presses(history, log, alignment.offset_s)
         if not calibrator.shows_wires:
             calibrator.learn_wires((given.scans[n].ratio for n in presses.scan), presses)
+            touched = history.touched
             history = calibrator.measure(given.scans, progress("scans"))
+            if calibrator.fault:  # presses of an open line would pass for weak ones elsewhere
+                history = replace(history, touched=history.touched & touched)
             presses = find_presses(history, log, alignment.offset_s)
     note = (
         f"offset of the clocks {alignment.offset_s:+.3f} s, correlation "
@@ -504,6 +507,8 @@ def _saved(calibration: Calibration, out: Path) -> Calibration:
 
 def _conclude(calibration: Calibration, calibrator: Calibrator, out: Path) -> None:
     """Say what was written. The largest force shows it if a sensor's newtons are none."""
+    if calibrator.fault:
+        TERMINAL.print(calibrator.fault)
     TERMINAL.print(_wires_in_words(calibration, calibrator))
     if (kept := calibration.geometry) is not None:
         TERMINAL.print(f"cells stay where {out} had them: {kept.kind}, in '{kept.frame_id}'")
