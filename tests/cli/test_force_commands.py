@@ -180,3 +180,12 @@ def test_presses_in_a_mode_that_no_calibration_takes_are_said_at_once(
     )
     assert "no calibration learns from this recording: a skin is calibrated in" in half
     assert "no calibration" not in near
+
+
+def test_a_replay_ends_with_a_picture_of_its_last_scan(run: Run, tmp_path: Path) -> None:
+    """As fast as it can, it showed the first scan alone."""
+    out = tmp_path / "a.mcap"
+    well(run("record", "emulator://4x4?speed=0", str(out), "--scans", "50"))
+    for method in ("none", "ohm"):
+        said = well(run("stream", f"replay://{out}?speed=0", "--method", method)).out
+        assert re.findall(r"scan (\d+) ", said) == ["0", "49"]

@@ -153,6 +153,15 @@ def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) 
     drawn_s = float("-inf")  # a skin in stepped time begins at 0
     live = Live(console=_out, auto_refresh=False) if _out.is_terminal else None
     reads_all = reader is not None and reader.focus is not None
+    is_due = True
+
+    def draw(scan: Scan) -> None:
+        picture = _picture(skin, reader, scan)
+        if live:
+            live.update(picture, refresh=True)
+        else:
+            WIDE.print(picture)
+
     with live or nullcontext():
         for scan in scans:
             is_due = scan.host_time_s - drawn_s >= (DISPLAY_EVERY_S if live else _PRINT_EVERY_S)
@@ -162,11 +171,9 @@ def _show_scans(skin: Device, reader: SkinReader | None, scans: Iterator[Scan]) 
                 scan = reader.read(scan)
             if is_due:
                 drawn_s = scan.host_time_s
-                picture = _picture(skin, reader, scan)
-                if live:
-                    live.update(picture, refresh=True)
-                else:
-                    WIDE.print(picture)
+                draw(scan)
+        if isinstance(skin, Replay) and not is_due:  # a recording ends with its last scan
+            draw(scan if reader is None or reads_all else reader.read(scan))
 
 
 def _picture(skin: Device, reader: SkinReader | None, shown: Scan) -> Group:
