@@ -173,7 +173,7 @@ def test_presses_that_tell_nothing_are_said_to() -> None:
     shares = scans.measure(rest_of(skin))
     assert not any(each.differs or each.known for each in shares)
     said = measured_in_words(Diagnosis(nominal_ohm=NOMINAL, pressed=shares))
-    assert said["wires"].startswith("not known: press with something smaller")
+    assert said["wires"].startswith("not known: tell --leads, or press with what is smaller")
     asked = Diagnosis(nominal_ohm=NOMINAL, pressed=shares)
     assert not asked.sound
     assert verdict(asked).endswith("these presses do not show the wires: see 'wires'")
