@@ -26,10 +26,11 @@ from ohmskin.estimate.base import TOUCH_STDS, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
+from ohmskin.estimate.touched import touched_at_rest, touched_cells
 from ohmskin.files import naming
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.curve import ForceModel
-from ohmskin.force.reader import now, touched_at_rest, touched_cells
+from ohmskin.force.reader import now
 from ohmskin.link.clock import scan_times_s
 from ohmskin.link.messages import Hello, Scan
 
@@ -157,7 +158,10 @@ def find_presses(history: LevelHistory, log: ForceLog, offset_s: float) -> Press
 
 
 def scan_period_s(time_s: Float) -> float:
-    """Time from one scan to the next [s], by the times of n scans. No board scans in 0.1 ms."""
+    """Time from one scan to the next [s], by the times of n scans; of a single one, any.
+
+    It is 0.1 ms at least, which no board is as fast as: whoever divides by it divides by no 0.
+    """
     return max(float(np.median(np.diff(time_s))), 1e-4) if time_s.size > 1 else MIN_PRESS_S
 
 

@@ -26,7 +26,7 @@ from ohmskin.cli.terminal import Terminal
 from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
-from ohmskin.force.reader import touched_at_rest, touched_cells
+from ohmskin.estimate.touched import touched_at_rest, touched_cells
 from ohmskin.link.device import SILENCE_TIMEOUT_S, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS, MODES, lines_of

@@ -135,7 +135,7 @@ def record(
             # A thread, because the end of the recording must not wait for a line.
             threading.Thread(target=_take_marks, args=(recorder,), daemon=True).start()
         try:
-            given = _watched(asked_for(until_ctrl_c(skin), scans, seconds), recorder)
+            given = _warned(asked_for(until_ctrl_c(skin), scans, seconds), recorder)
             if force_port == TRUTH:
                 given = with_truth(given, skin, recorder)
             recording.record(skin, recorder, given, tare_s=tare_s, sensor=sensor, beside=look)
@@ -147,13 +147,13 @@ def record(
     TERMINAL.print(f"{file}: {done}{unread(sensor)}")
 
 
-def _watched(scans: Iterable[Scan], recorder: Recorder) -> Iterator[Scan]:
-    """Pass scans on, and warn once of cells that seem touched in the tare."""
-    seen = recorder.tare
+def _warned(scans: Iterable[Scan], recorder: Recorder) -> Iterator[Scan]:
+    """Pass scans on, and warn of cells that seem touched in the tare, when there is one."""
+    is_judged = False
     for scan in scans:
-        if recorder.tare is not None and recorder.tare is not seen:
-            seen = recorder.tare
-            warn_of_touched(recorder.board, seen.rest_ratio)
+        if recorder.tare is not None and not is_judged:
+            is_judged = True
+            warn_of_touched(recorder.board, recorder.tare.rest_ratio)
         yield scan
 
 
@@ -340,7 +340,8 @@ def _at_once(
 
         with ExitStack() as stack:
             # Workers may be killed, as dask's are by Ctrl-C, or go on elsewhere. This comes last.
-            stack.callback(remove_parts, run := token_hex(8), [to for _, to in pairs])
+            run = token_hex(8)
+            stack.callback(remove_parts, run, [to for _, to in pairs])
             if backend == "dask":
                 from dask.distributed import Client
 

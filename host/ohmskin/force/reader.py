@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ohmskin.arrays import FULL_SCALE_N, Bool, Float, heat_map
+from ohmskin.arrays import FULL_SCALE_N, Float, heat_map
 from ohmskin.circuit.configurations import is_near
 from ohmskin.errors import TareRefused
-from ohmskin.estimate.base import TOUCH_SIEMENS, Estimate, Estimator
+from ohmskin.estimate.base import Estimate, Estimator
 from ohmskin.estimate.knowledge import NO_WIRES, REF_LOG_STD, SkinKnowledge
 from ohmskin.estimate.methods import kind_of, make_estimator
+from ohmskin.estimate.touched import touched_cells
 from ohmskin.files import Closing
 from ohmskin.force.calibration import Calibration, Rest
 from ohmskin.force.contacts import Contact, ContactTracker, around, found
@@ -49,14 +50,6 @@ LATE_S: Final = 0.1
 # A cell that conducts less than this share of what it did at rest counts as open. Chosen: rests
 # drift by a third, and an open line leaves a thousandth.
 _OPEN_SHARE: Final = 0.1
-# At least this share of the cells is taken to be untouched at rest. Chosen: so three touched cells
-# of four are found.
-UNTOUCHED_SHARE: Final = 0.25
-# A cell that conducts more than untouched ones by this factor at rest is touched. Chosen: untouched
-# cells scatter by tens of percent, and a touch of 100 kOhm is a factor of eleven.
-TOUCHED_TIMES: Final = 8.0
-# An error names so many touched cells, and counts the others. Chosen: so many fit into a line.
-_NAMED_CELLS: Final = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -578,25 +571,3 @@ def _layer_std(estimator: Estimator) -> float:
 def now() -> str:
     """The date and time of the host, ISO 8601, UTC, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def touched_at_rest(knowledge: SkinKnowledge) -> Bool:
-    """Which cells (R, C) seem to have been touched while the rest was measured.
-
-    There is no earlier rest to compare with. So these are cells that conduct far more than most
-    others: g > `TOUCHED_TIMES` max(quantile of g, 0.5e-6 S), a limit that wires and the scatter of
-    cells do not reach.
-    """
-    at_rest = make_estimator(DEFAULT_METHOD, knowledge).rest()
-    assert at_rest is not None  # the readings are known
-    siemens = at_rest.cell_siemens
-    untouched = float(np.quantile(siemens, UNTOUCHED_SHARE, method="lower"))
-    return np.asarray(siemens > TOUCHED_TIMES * max(untouched, TOUCH_SIEMENS))
-
-
-def touched_cells(touched: Bool) -> str:
-    """Which cells are touched, in words."""
-    cells = [f"({row}, {column})" for row, column in np.argwhere(touched)]
-    more = len(cells) - _NAMED_CELLS
-    text = ", ".join(cells[:_NAMED_CELLS]) + (f" and {more} more" if more > 0 else "")
-    return f"cell {text} is touched" if len(cells) == 1 else f"cells {text} are touched"
