@@ -23,6 +23,8 @@ small     2x2 and 3x3, five pairs: over `joint` told.
 few       presses of 12 cells alone, of 8x8, five pairs: over `joint` told, over `ohm`.
 sparse    one, two, three presses of every cell, and five, 8x8, 50/100 and 500/1000: RMSE [N].
 newtons   leads of 600 ohm at every line, 100/200 ohm a segment: over `ohm`.
+odd       one line with a lead of 2 kohm, at others none, 50/100 and 50/600: over `joint` told of
+          the segments, and that there are no leads; over `ohm`.
 leads     conductances, no forces: 100/200 ohm a segment, leads of so many ohm at every line; random
           touches, and fingertips. within_4: of pressed cells. wrong: frames with a cell off by
           half, by 10 uS and by 4 deviations, though they converged. told, far: the median of the
@@ -215,6 +217,13 @@ def tasks_of(group: str, part: Part, seed: int) -> list[Task]:
                 for number in range(part.of(2))
                 for plan in behind[: len(LAWS)]
             ]
+        case "odd":
+            usual = FIVE[1], FIVE[4]
+            return [
+                Task(group, replace(plan, seed=seed + number, odd_lead_ohm=2000.0))
+                for number, plan in enumerate(plans)
+                if plan.wire_ohm in usual or part is not ALL
+            ]
     raise KeyError(group)
 
 
@@ -307,6 +316,8 @@ def figures_of(method: str) -> list[Figure]:
         ("few", "few_median", ratio(), np.median, at_most, 1.05),
         ("few", "few_over_ohm", ratio(OHM), np.max, at_most, 1.05),
         ("newtons", "leads_over_ohm", ratio(OHM), np.max, at_most, 0.92),
+        ("odd", "odd_over_told", ratio(), np.max, at_most, 1.1),
+        ("odd", "odd_over_ohm", ratio(OHM), np.max, at_most, 0.92),
     ]
     return [Figure(group, f"{method}_{name}", *more) for group, name, *more in rows]
 

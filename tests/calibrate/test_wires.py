@@ -106,6 +106,64 @@ def test_an_open_line_is_said_and_changes_nothing_else(tmp_path: Path) -> None:
     assert wires.lead == pytest.approx(0.0, abs=3 * wires.lead_std_ohm)
 
 
+def with_own_lead(of: Skin, line: int, own_ohm: float) -> Skin:
+    leads = of.lead_ohm.copy()
+    leads[line] += own_ohm
+    return replace(of, lead_ohm=leads)
+
+
+@pytest.mark.parametrize(("line", "own_ohm"), [(2, 2000.0), (9, 700.0)])
+def test_a_lead_unlike_the_others_is_found(line: int, own_ohm: float) -> None:
+    """A row's and a column's, beside leads of 300 ohm and cells that scatter. As long as nothing
+    looked for it, it passed for a scatter of all contacts, and the wires were not found.
+    """
+    even = skin((6, 6), 100.0, 200.0, 300.0)
+    found = found_by(with_own_lead(even, line, own_ohm), WireOhm(), list(range(36)), 0.1)
+    assert found.own_lead_ohm is not None
+    assert np.flatnonzero(found.own_lead_ohm).tolist() == [line]
+    assert found.own_lead_ohm[line] == pytest.approx(own_ohm, rel=0.2)
+    assert found.odd_stripe is None
+    np.testing.assert_allclose(found.wires.both, (100, 200), rtol=0.15)
+
+
+@pytest.mark.parametrize(("line", "more"), [(3, 3.0), (7, 2.0)])
+def test_a_stripe_unlike_the_others_is_no_lead(line: int, more: float) -> None:
+    """A row's segments have 200 ohm more, and a column's."""
+    even = skin((6, 6), 100.0, 200.0)
+    top, bottom = even.top_wire_ohm.copy(), even.bottom_wire_ohm.copy()
+    layer = top[line] if line < 6 else bottom[:, line - 6]
+    layer *= more
+    worn = replace(even, top_wire_ohm=top, bottom_wire_ohm=bottom)
+    found = found_by(worn, WireOhm(), list(range(36)), 0.05)
+    assert found.own_lead_ohm is None
+    assert found.odd_stripe is not None
+    assert found.odd_stripe.line == line
+    assert found.odd_stripe.ohm == pytest.approx(200.0, rel=0.2)
+
+
+def test_no_line_of_even_ones_is_odd() -> None:
+    for seed in range(10):
+        found = found_by(skin((5, 4), 60.0, 30.0), WireOhm(), list(range(20)), 0.2, seed)
+        assert (found.own_lead_ohm, found.odd_stripe) == (None, None)
+
+
+def test_a_lead_unlike_the_others_costs_no_force(tmp_path: Path) -> None:
+    """2 kohm more at a column: `touch` was 1.3 N off, three times as much as `ohm`."""
+    errors_n = []
+    for own_ohm in (0.0, 2000.0):
+        plan = Plan((50.0, 600.0), "series", 9, (6, 6), odd_lead_ohm=own_ohm, touches=40)
+        pressed = PressedSkin(plan)
+        recording = tmp_path / f"presses-{own_ohm:.0f}.mcap"
+        pressed.record(recording)
+        said = calibrate(recording, tmp_path / "skin.json", "touch")
+        errors_n.append(pressed.read(tmp_path / "skin.json").rmse_n())
+    assert errors_n[1] < 1.15 * errors_n[0]
+    own_ohm = load_calibration(tmp_path / "skin.json").own_lead_ohm
+    assert own_ohm is not None
+    assert own_ohm[9] == pytest.approx(2000.0, rel=0.15)
+    assert f"leads unlike the others': column 3 +{own_ohm[9]:.0f} ohm: forces count them" in said
+
+
 def test_leads_are_what_the_usual_contact_leaves_in_series() -> None:
     found = found_by(skin((5, 4), 100.0, 200.0, 600.0), WireOhm(), list(range(20)))
     assert found.wires.both == pytest.approx((100.0, 200.0), rel=0.05)

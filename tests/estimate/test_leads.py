@@ -10,9 +10,11 @@ from itertools import product
 import numpy as np
 import pytest
 
+from network import SkinCircuit
 from ohmskin.arrays import Float
 from ohmskin.circuit.skin import Skin
 from ohmskin.estimate.base import Estimate
+from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
 from studies.trials import Trial, finger_trial, random_trial, skin_at_rest, trial_of
 
@@ -219,3 +221,31 @@ def test_a_cell_that_opened_beside_a_fingertip_is_named() -> None:
     trial = trial_of(rest, [replace(rest, cell_siemens=siemens)])
     answers, _ = estimates(trial, "joint", None)
     assert "cell (4, 2): conducts less than at rest" in answers[0].message
+
+
+def test_what_a_lead_has_above_the_others_is_taken_off_all_readings() -> None:
+    """Exact readings by the nodes' equations, behind leads of all kinds: the answers are those of
+    the same skin without them. Methods without leads are told nothing.
+    """
+    random = np.random.default_rng(5)
+    trial = random_trial(5, 4, 3, 2, 11)
+    own_ohm = random.uniform(-50.0, 3000.0, 9)
+    even = replace(trial.rest, lead_ohm=np.full(9, 100.0))
+    answers: dict[str, list[list[Float]]] = {"joint": [], "ohm": []}
+    for skin, own in ((even, None), (replace(even, lead_ohm=100.0 + own_ohm), own_ohm)):
+        circuit = SkinCircuit(skin)
+        rest, *frames = (
+            circuit.readings(cells)[..., :4] for cells in (skin.cell_siemens, *trial.cell_siemens)
+        )
+        known = SkinKnowledge(5, 4, rest_ratio=rest, own_lead_ohm=own)
+        for method, of_skins in answers.items():
+            estimator = make_estimator(method, known)
+            of_skins.append([estimator.estimate(frame).cell_siemens for frame in frames])
+    np.testing.assert_allclose(*answers["joint"], rtol=1e-6)
+    assert not np.allclose(*answers["ohm"], rtol=1e-3)
+
+
+@pytest.mark.parametrize("own_ohm", [np.zeros(8), np.full(9, np.nan), np.full(9, 1e30)])
+def test_leads_that_cannot_be_are_refused(own_ohm: Float) -> None:
+    with pytest.raises(ValueError, match="own_lead_ohm must be 9 numbers"):
+        SkinKnowledge(5, 4, own_lead_ohm=own_ohm)

@@ -50,6 +50,7 @@ def calibration(pressed: int = 5) -> Calibration:
         indenter_area_m2=1e-4,
         nominal_wire_ohm=WireOhm(100.0),
         largest_force_n=float(force_n.max()),
+        own_lead_ohm=np.array([0.0, 700.25, 0.0, 0.0, -20.0]),
     )
 
 
@@ -129,11 +130,11 @@ def test_files_of_before_leads_and_modes_are_read(tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     for name in ("mode", "nominal_lead_ohm", "lead_std_ohm", "top_wire_log_std", "curve_lead_ohm"):
         del content[name]
-    for name in ("bottom_wire_log_std", "largest_force_n"):
+    for name in ("bottom_wire_log_std", "largest_force_n", "own_lead_ohm"):
         del content[name]
     path.write_text(json.dumps(content | {"wire_log_std": 0.125}))
     loaded = load_calibration(path)
-    assert (loaded.mode, loaded.largest_force_n) == ("near", None)
+    assert (loaded.mode, loaded.largest_force_n, loaded.own_lead_ohm) == ("near", None, None)
     wires = loaded.nominal_wire_ohm
     assert (wires.lead, wires.lead_std_ohm) == (None, None)
     assert (wires.top_log_std, wires.bottom_log_std) == (0.125, 0.125)
@@ -276,6 +277,8 @@ def put(*place: Any) -> Callable[[dict[str, Any]], None]:
         (put("largest_force_n", -1), "largest_force_n is -1.0, it must be above 0"),
         (put("nominal_top_wire_ohm", -1), "nominal_top_wire_ohm is -1, it must be from 0"),
         (put("nominal_bottom_wire_ohm", []), "nominal_bottom_wire_ohm holds list, not float"),
+        (put("own_lead_ohm", [0.0] * 6), "own_lead_ohm has not the shape (5,)"),
+        (put("own_lead_ohm", [1e50] * 5), "own_lead_ohm must be 5 numbers within"),
     ],
 )
 def test_edited_files_are_refused_by_field(
@@ -354,7 +357,8 @@ def test_whatever_a_field_holds_it_is_taken_or_refused_in_one_line(
     name = draw.draw(st.sampled_from(sorted(content)))
     value = draw.draw(JSON)
     if isinstance(content[name], list) and draw.draw(st.booleans()):
-        content[name][0][0] = value
+        row = content[name][0]
+        (row if isinstance(row, list) else content[name])[0] = value
     else:
         content[name] = value
     edited = saved.with_name("edited.json")

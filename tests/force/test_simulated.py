@@ -66,6 +66,17 @@ def test_its_skin_is_that_of_the_calibration() -> None:
     assert scan.estimate.cell_siemens[2, 5] - rest == pytest.approx(NEWTON_SIEMENS, rel=0.02)
 
 
+def test_a_line_with_a_lead_of_its_own_is_read_as_the_others() -> None:
+    """3 kohm more at row 2: of 8 N there, 2.8 N are lost where nobody knows it."""
+    own_ohm = np.zeros(16)
+    own_ohm[2] = 3000.0
+    force_n = np.zeros((8, 8))
+    force_n[2, 5] = 8.0
+    known = replace(of_scene("rest"), own_lead_ohm=own_ohm)
+    scan = ohmskin.SimulatedSkin(known, noise_lsb=0.0).step(force_n, 0.0)
+    assert scan.force_n[2, 5] == pytest.approx(8.0, rel=0.03)
+
+
 def test_its_wires_are_those_of_the_curves() -> None:
     """Others were learned since the presses."""
     wires = WireOhm(250.0, 500.0, 80.0, 0.05, 0.05, 20.0, 100.0, 200.0, 80.0)

@@ -138,6 +138,7 @@ class Plan:
 
     wire_ohm: a segment of the top layer, and of the bottom one. law: a name of `LAWS`.
     seed: of everything. shape: of the skin. lead_ohm: a lead of every line.
+    odd_lead_ohm: what one line, by the seed, has more of a lead.
     presses_of: so many cells, at random, are pressed; None: all.
     presses: of each of these, the hardest ones of five.
     touches: so many frames are read later, each of other touches.
@@ -148,6 +149,7 @@ class Plan:
     seed: int
     shape: tuple[int, int] = (8, 8)
     lead_ohm: float = 0.0
+    odd_lead_ohm: float = 0.0
     presses_of: int | None = None
     presses: int = PEAKS_N.size
     touches: int = 100
@@ -162,6 +164,7 @@ class PressedSkin:
         self._random = random = np.random.default_rng(keys)
         rest = skin_at_rest(*plan.shape, random, wire_ohm=plan.wire_ohm)
         leads_ohm = plan.lead_ohm * np.exp(SPREAD * random.standard_normal(sum(plan.shape)))
+        leads_ohm[plan.seed % leads_ohm.size] += plan.odd_lead_ohm
         self.rest = replace(rest, lead_ohm=leads_ohm)
         # Of each cell: times and forces, straight in between.
         self._knots: list[list[tuple[float, float]]] = [[(0.0, 0.0)] for _ in range(cells)]

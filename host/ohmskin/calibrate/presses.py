@@ -274,7 +274,8 @@ class Calibrator:
         It is told that the skin was not bent since its wires were measured: the presses that show
         the wires are the ones that it estimates.
         """
-        knowledge = SkinKnowledge.of(self.board, self.rest_ratio, wires)
+        own = None if self.found is None else self.found.own_lead_ohm
+        knowledge = SkinKnowledge.of(self.board, self.rest_ratio, wires, own_lead_ohm=own)
         self.knowledge = replace(knowledge, may_be_bent=False)
         self.estimator = make_estimator(self.method, self.knowledge)
         self.rest_level = self.estimator.rest_level()
@@ -410,4 +411,5 @@ class Calibrator:
             nominal_wire_ohm=self.estimator.wires() if self.shows_wires else told,
             mode=self.board.mode,
             largest_force_n=largest_force_n,
+            own_lead_ohm=self.knowledge.own_lead_ohm,
         )

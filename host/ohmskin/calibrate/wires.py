@@ -46,10 +46,15 @@ v are replaced by the most likely ones. Two leads and r lie in series, so presse
 alone, and the prior of r divides it: what is above the usual r is taken for the leads. The
 covariance of p is that of least squares. Layers that were told, and leads, are tried as told and as
 never told, and the most probable of these is the answer (`WRONGLY_TOLD`).
+
+After a fit, the line is sought that is the most unlike the others (`_PressFit.oddest_line`). What
+its lead has above theirs is taken off the readings of its ports, and all is fitted again, until no
+lead is odd.
 """
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -60,6 +65,7 @@ from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.skin import wire_coupling_ohm
 from ohmskin.circuit.small import one_blas_thread, solve_positive
 from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, SkinKnowledge, WireOhm
+from ohmskin.estimate.port_currents import PortCurrents
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
@@ -110,6 +116,16 @@ UNCLEAR_LOG: Final = 0.5
 # alone. Chosen: so that it takes wires which are off by more than skins stretch.
 WRONGLY_TOLD: Final = 0.01
 
+# Lines unlike the others.
+# A line is odd if its lead or its segments differ from others' by so many deviations. Chosen: lines
+# of sound skins differ by 3 at most, and a lead of 600 ohm at lines of 100 ohm a segment by 7.
+ODD_STDS: Final = 5.0
+# So many cells of it must have been pressed. Chosen: an odd contact or two are no odd line.
+LEAST_CELLS: Final = 3
+# At most this share of the lines is told to have a lead of its own. Chosen: what a quarter has is
+# not odd.
+ODD_LINES: Final = 0.25
+
 # The search.
 # Both layers start from these [ohm]. Chosen: from wires that are too small, it finds larger ones;
 # the others are for minima that nobody has seen.
@@ -146,6 +162,21 @@ class PressReadings(NamedTuple):
     current_std: Float
 
 
+class LineExcess(NamedTuple):
+    """What one line has, and the others of its layer have not.
+
+    line: its number; columns follow the rows.
+    ohm: of its lead, or of each of its segments [ohm].
+    stds: this over its standard deviation [1].
+    is_lead: whether a lead explains the presses of its cells better than segments do.
+    """
+
+    line: int
+    ohm: float
+    stds: float
+    is_lead: bool
+
+
 @dataclass(frozen=True)
 class FoundWires:
     """What presses tell of the wires, together with what was told.
@@ -155,12 +186,16 @@ class FoundWires:
     presses: how many presses there were.
     unclear: layers whose wires are not clear: the deviation of their log is above `UNCLEAR_LOG`,
         and the longest line is uncertain by more ohms than the hardest touch has.
+    own_lead_ohm: what single leads have above the others (`SkinKnowledge`); None: nothing.
+    odd_stripe: a line whose segments are unlike those of the other lines; None: no press shows one.
     """
 
     wires: WireOhm
     told: WireOhm
     presses: int
     unclear: tuple[str, ...]
+    own_lead_ohm: Float | None = None
+    odd_stripe: "LineExcess | None" = None
 
     @property
     def disagrees(self) -> bool:
@@ -210,14 +245,57 @@ class _Expected(NamedTuple):
     series_ohm: float
 
 
+class _Best(NamedTuple):
+    """A minimum: -2 log of the evidence, p, the covariance of p (7, 7), the roots of v (6,)."""
+
+    score: float
+    p: Float
+    covariance: Float
+    scatter: Float
+
+
 @one_blas_thread
 def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     """The wires by presses. knowledge: of the skin, with its rest readings and what was told.
 
     Raises ValueError where no scan shows a press.
     """
+    shape = knowledge.rows, knowledge.columns
+    own_ohm = np.zeros(sum(shape))
+    for left in reversed(range(1 + int(ODD_LINES * own_ohm.size))):
+        fit, best = _best_fit(knowledge, readings, own_ohm)
+        odd = fit.oddest_line(best)
+        if odd is None or not odd.is_lead or not left:
+            break
+        own_ohm[odd.line] += odd.ohm
+    if knowledge.own_lead_ohm is not None:  # it has been taken off these readings
+        own_ohm += knowledge.own_lead_ohm
+    p, std = best.p, np.sqrt(best.covariance.diagonal())
+    top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
+    lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
+    top_std, bottom_std = std[:2].tolist()
+    wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std_ohm)
+    return FoundWires(
+        wires,
+        knowledge.nominal_wire_ohm,
+        np.unique(readings.press).size,
+        unclear_layers(p[:2], std[:2], shape),
+        own_ohm if own_ohm.any() else None,
+        None if odd is None or odd.is_lead else odd,
+    )
+
+
+def _best_fit(
+    knowledge: SkinKnowledge, readings: PressReadings, own_ohm: Float
+) -> tuple["_PressFit", "_Best"]:
+    """The most probable fit, where single leads have so much above the others (R+C,) [ohm]."""
     assert knowledge.rest_ratio is not None
-    rest = PortReader(knowledge).read(knowledge.rest_ratio)
+    read = PortReader(knowledge).read(knowledge.rest_ratio)
+    of_ports = np.add.outer(own_ohm[: knowledge.rows], own_ohm[knowledge.rows :])
+    rest = PortCurrents(read.current, read.current_std).without(of_ports)
+    of_presses = PortCurrents(readings.current, readings.current_std)
+    pressed = of_presses.without(of_ports.flat[readings.cells])
+    readings = readings._replace(current=pressed.current, current_std=pressed.std)
     rows = _rows(readings, rest.current.ravel())
     told = knowledge.nominal_wire_ohm
     lead_alone = WireOhm(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
@@ -228,17 +306,10 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     tried = []
     for wires, cost in costs.items():
         known = replace(knowledge, nominal_wire_ohm=wires)
-        fit = _PressFit(known, rows, rest.current.ravel(), rest.current_std.ravel())
-        tried += [(cost + found[0], *found[1:]) for found in map(fit.minimised, STARTS_OHM)]
-    p, covariance = min(tried, key=lambda found: found[0])[1:]
-    std = np.sqrt(covariance.diagonal())
-    top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
-    lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
-    top_std, bottom_std = std[:2].tolist()
-    wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std_ohm)
-    presses = np.unique(readings.press).size
-    unclear = unclear_layers(p[:2], std[:2], (knowledge.rows, knowledge.columns))
-    return FoundWires(wires, told, presses, unclear)
+        fit = _PressFit(known, rows, rest.current.ravel(), rest.std.ravel())
+        tried += [(cost + found.score, fit, found) for found in map(fit.minimised, STARTS_OHM)]
+    _, fit, best = min(tried, key=lambda one: one[0])
+    return fit, best
 
 
 def unclear_layers(logs: Float, stds: Float, shape: tuple[int, int]) -> tuple[str, ...]:
@@ -399,11 +470,8 @@ class _PressFit:
 
     # ----------------------------------------------------------------------------- the search
 
-    def minimised(self, start_ohm: float) -> tuple[float, Float, Float]:
-        """The fit that starts from segments of `start_ohm`, both layers alike.
-
-        Returns -2 log of the evidence, p, and the covariance of p (7, 7).
-        """
+    def minimised(self, start_ohm: float) -> _Best:
+        """The fit that starts from segments of `start_ohm`, both layers alike."""
         from scipy.optimize import least_squares
 
         p, scatter = self._start(start_ohm), SCATTER
@@ -426,7 +494,40 @@ class _PressFit:
         precision = found.jac.T @ found.jac
         # Of the likelihood times the prior, by Laplace's integral over p.
         score += float(from_centre @ from_centre) + 2 * float(np.log(self._std).sum())
-        return score + float(np.linalg.slogdet(precision)[1]), p, np.linalg.inv(precision)
+        score += float(np.linalg.slogdet(precision)[1])
+        return _Best(score, p, np.linalg.inv(precision), scatter)
+
+    def oddest_line(self, best: _Best) -> LineExcess | None:
+        """The line whose lead, or segments, are the most unlike the others'; None if none is.
+
+        With y' = y - d x, of which d is by a lead of the line, or by each of its segments, and J
+        the slopes of the residual by p, the best x is, together with the change of p that it makes,
+
+            x = d^T Q y / (d^T Q d) ,  Q = 1 - J (J^T J)^-1 J^T ,
+
+        all of them whitened by C. Its deviation is (d^T Q d)^-1/2.
+        """
+        model = self._expected(best.p)
+        whitener = self._whitener(model, best.scatter)
+        residual, slopes = self._residual(best.p, whitener), self._slopes(best.p, whitener)
+        basis, _ = np.linalg.qr(slopes)
+        residual -= basis @ (basis.T @ residual)
+        by_path = np.where(self._is_row, model.by_path[self._block], 0.0)
+        odd, (row, column) = [], np.divmod(self._cells, self._shape[1])
+        for line, is_lead in product(range(sum(self._shape)), (True, False)):
+            is_column = line >= self._shape[0]
+            on_line = column == line - self._shape[0] if is_column else row == line
+            if on_line.sum() < LEAST_CELLS:
+                continue
+            segments = 1.0 if is_lead else 1.0 + (row if is_column else column)
+            by_ohm = whitener(by_path * (on_line * segments)[:, None]).ravel()
+            slope = np.append(by_ohm, np.zeros(best.p.size))
+            slope -= basis @ (basis.T @ slope)
+            square = max(float(slope @ slope), 1e-9 * float(by_ohm @ by_ohm))
+            ohm = float(slope @ residual) / square
+            odd.append(LineExcess(line, ohm, ohm * square**0.5, is_lead))
+        oddest = max(odd, key=lambda one: abs(one.stds), default=None)
+        return oddest if oddest is not None and abs(oddest.stds) > ODD_STDS else None
 
     def _start(self, start_ohm: float) -> Float:
         """p with these wires, and the level of the law by the median row."""

@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 from typer import Argument, Option
@@ -27,6 +28,7 @@ from ohmskin.emulate.board import DEFAULT_RATE_HZ
 from ohmskin.errors import DeviceLost, OhmskinError, PortError
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.touched import touched_at_rest, touched_cells
+from ohmskin.force.calibration import Calibration
 from ohmskin.link.device import SILENCE_TIMEOUT_S, scans_for
 from ohmskin.link.messages import Hello, Scan
 from ohmskin.link.protocol import ENUMS, MODES, lines_of
@@ -83,6 +85,23 @@ def wires_of(text: str, lead_ohm: float | None) -> WireOhm:
     except ValueError:
         raise ValueError(f"--wires wants two numbers, as 100,200, not '{text}'") from None
     return WireOhm(top, bottom, lead_ohm).check()
+
+
+def line_name(line: int, rows: int) -> str:
+    """What a line is called of which columns follow the rows."""
+    return f"row {line}" if line < rows else f"column {line - rows}"
+
+
+def own_leads_in_words(calibration: Calibration) -> str:
+    """Which lines have a lead of their own, and how much more than others; empty if none has."""
+    own_ohm = calibration.own_lead_ohm
+    if own_ohm is None:
+        return ""
+    odd = [
+        f"{line_name(line, calibration.rows)} {own_ohm[line]:+.0f} ohm"
+        for line in np.flatnonzero(own_ohm).tolist()
+    ]
+    return f"leads unlike the others': {', '.join(odd)}"
 
 
 def ports(as_json: Annotated[bool, Option("--json", help="one JSON array")] = False) -> None:

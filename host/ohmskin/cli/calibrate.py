@@ -25,7 +25,16 @@ from ohmskin.calibrate.scale import printed_s, wrong_numbers
 from ohmskin.calibrate.sessions import beside, check_same, joined, session_paths
 from ohmskin.calibrate.tables import ForceLog, load_force_log, load_press_table
 from ohmskin.calibrate.wires import UNCLEAR_LOG
-from ohmskin.cli.board import TERMINAL, Leads, Port, Seconds, Wires, wires_of
+from ohmskin.cli.board import (
+    TERMINAL,
+    Leads,
+    Port,
+    Seconds,
+    Wires,
+    line_name,
+    own_leads_in_words,
+    wires_of,
+)
 from ohmskin.cli.knead import kneaded
 from ohmskin.cli.record import TRUTH, ForceBaud, ForceColumn, ForceScale, ForceUnit, progress
 from ohmskin.cli.scale import grams_of, scale
@@ -510,6 +519,13 @@ def _conclude(calibration: Calibration, calibrator: Calibrator, out: Path) -> No
     if calibrator.fault:
         TERMINAL.print(calibrator.fault)
     TERMINAL.print(_wires_in_words(calibration, calibrator))
+    if own_leads := own_leads_in_words(calibration):
+        remedy = "forces count them. If a crimp is loose there, mend it and calibrate anew"
+        TERMINAL.print(f"{own_leads}: {remedy}")
+    if calibrator.found is not None and (odd := calibrator.found.odd_stripe) is not None:
+        name = line_name(odd.line, calibration.rows)
+        stripe = f"{name} has {odd.ohm:+.0f} ohm a segment against the others of its layer"
+        TERMINAL.print(f"{stripe}: is its stripe worn, stretched, or of another yarn?")
     if (kept := calibration.geometry) is not None:
         TERMINAL.print(f"cells stay where {out} had them: {kept.kind}, in '{kept.frame_id}'")
     of = f"{out}: calibration of unit {calibration.unit_id}"

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from typer import Argument, Option
 
-from ohmskin.cli.board import TERMINAL
+from ohmskin.cli.board import TERMINAL, own_leads_in_words
 from ohmskin.cli.picture import check_picture, picture
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.force.calibration import load_calibration
@@ -59,6 +59,8 @@ def skin(
     TERMINAL.print(f"{file}: unit {known.unit_id}, {size}, mode {known.mode}")
     TERMINAL.print(f"calibrated {known.date} by '{known.method}'{tare or ''}")
     TERMINAL.print(_wires_in_words(known.nominal_wire_ohm))
+    if own_leads := own_leads_in_words(known):
+        TERMINAL.print(own_leads)
     if placed is None:
         TERMINAL.print("nobody has said where the cells are: --pitch-mm 10,10 does")
         return

@@ -8,7 +8,7 @@ which cells are touched happen here, so that all methods do them alike.
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -139,12 +139,14 @@ class Estimator(ABC):
     """One method for one skin, frame after frame. Raises ValueError for readings it cannot take.
 
     name: what the method is called. takes_far: whether it takes readings at far ends.
-    takes_partial: whether it takes frames of which not all was read.
+    takes_partial: whether it takes frames of which not all was read. takes_leads: whether what is
+    told of the leads counts.
     """
 
     name: ClassVar[str]
     takes_far: ClassVar[bool] = False
     takes_partial: ClassVar[bool] = True
+    takes_leads: ClassVar[bool] = False
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         if knowledge.checked_names != NEAR and not self.takes_far:
@@ -154,7 +156,8 @@ class Estimator(ABC):
                 "'ohmskin configure PORT --mode near --save'"
             )
         self.knowledge = knowledge
-        self._reader = PortReader(knowledge)
+        told = knowledge if self.takes_leads else replace(knowledge, own_lead_ohm=None)
+        self._reader = PortReader(told)
         self._rest: Solution | None = None
 
     @abstractmethod

@@ -77,6 +77,7 @@ class JointEstimator(Estimator):
 
     name: ClassVar[str] = "joint"
     takes_far: ClassVar[bool] = True
+    takes_leads: ClassVar[bool] = True
 
     def __init__(self, knowledge: SkinKnowledge) -> None:
         super().__init__(knowledge)

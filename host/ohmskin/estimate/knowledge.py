@@ -217,6 +217,8 @@ class SkinKnowledge:
     may_be_bent: whether the skin may have been bent since its wires were measured.
     are_wires_sure: whether wires and leads are just as told. Else weak cells beside hard ones may
         look like longer wires, and `joint` takes care that they do not.
+    own_lead_ohm: what the lead of each row, then of each column, has above the nominal one
+        (R+C,) [ohm]; None: nothing that is known. At near ends, it is taken off all ports.
     ref_log_std: standard deviation of the log of the references, for an error that both have in
         common; 0: they are exact. All resistances then have this error, and no reading shows it,
         because readings are ratios.
@@ -233,6 +235,7 @@ class SkinKnowledge:
     may_be_bent: bool = True
     are_wires_sure: bool = False
     ref_log_std: float = 0.0
+    own_lead_ohm: Float | None = None
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
@@ -253,6 +256,8 @@ class SkinKnowledge:
         self.nominal_wire_ohm.check()
         if not 0 <= self.ref_log_std <= 1:
             raise ValueError(f"ref_log_std is {self.ref_log_std:g}, it must be from 0 to 1")
+        if self.own_lead_ohm is not None:
+            check_own_leads(self.own_lead_ohm, self.rows, self.columns)
 
     @classmethod
     def of(
@@ -261,11 +266,30 @@ class SkinKnowledge:
         rest_ratio: Float | None = None,
         nominal_wire_ohm: WireOhm = NO_WIRES,
         ref_log_std: float = REF_LOG_STD,
+        own_lead_ohm: Float | None = None,
     ) -> Self:
         """What is known of the skin at this board."""
         size, references = (board.rows, board.columns), (board.ref_top_ohm, board.ref_bottom_ohm)
         told, names = (rest_ratio, nominal_wire_ohm), MODES[board.mode]
-        return cls(*size, *references, board.adc_bits, *told, names, ref_log_std=ref_log_std)
+        return cls(
+            *size,
+            *references,
+            board.adc_bits,
+            *told,
+            names,
+            ref_log_std=ref_log_std,
+            own_lead_ohm=own_lead_ohm,
+        )
+
+    @property
+    def own_lead_of_ports(self) -> Float | None:
+        """What the leads of each port's two lines have above nominal ones, (R, C) [ohm], or None.
+
+        Where far ends are read, each frame measures the leads, so nothing is taken off.
+        """
+        if self.own_lead_ohm is None or not is_near(self.reading_names):
+            return None
+        return np.add.outer(self.own_lead_ohm[: self.rows], self.own_lead_ohm[self.rows :])
 
     @property
     def checked_names(self) -> tuple[str, ...]:
@@ -286,6 +310,12 @@ class SkinKnowledge:
     def ref_ohm(self) -> float:
         """Both reference resistors in series [ohm]: all that limits a shorted port's current."""
         return self.ref_top_ohm + self.ref_bottom_ohm
+
+
+def check_own_leads(ohm: Float, rows: int, columns: int) -> None:
+    """Raise ValueError unless these are finite numbers for all lines, (R+C,), within `MAX_OHM`."""
+    if np.shape(ohm) != (rows + columns,) or not np.all(np.abs(ohm) <= MAX_OHM):
+        raise ValueError(f"own_lead_ohm must be {rows + columns} numbers within {MAX_OHM:g} ohm")
 
 
 def check_ratio(

@@ -96,6 +96,9 @@ DEAD_STDS: Final = 5.0
 # [1] U, over the voltage R_s I that the references lose, is taken to be at least this. Chosen: u is
 # 1 / (R_s (1 + this)), which noise must not make infinite or negative.
 LEAST_APART: Final = -0.9
+# [1] 1 - ohm I of `PortCurrents.without` is at least this. Chosen: noise, and a lead that is told
+# wrongly, then leave a current that is finite.
+LEAST_LEFT: Final = 0.1
 
 
 class PortCurrents(NamedTuple):
@@ -103,6 +106,11 @@ class PortCurrents(NamedTuple):
 
     current: Float
     std: Float
+
+    def without(self, ohm: Float) -> "PortCurrents":
+        """The currents if each port had so much less in series (R, C) [ohm]: 1/I' = 1/I - ohm."""
+        left = np.maximum(1.0 - self.current * ohm, LEAST_LEFT)
+        return PortCurrents(self.current / left, self.std / left**2)
 
 
 class NearReadings(NamedTuple):

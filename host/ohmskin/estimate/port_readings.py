@@ -88,7 +88,7 @@ class PortReader:
         per_cell, square_ohm = self._near_ends.per_cell, self._near_ends.square_ohm
         self._noise = ReadingNoise(knowledge, per_cell, square_ohm)
         self._partial = PartialEnds(knowledge)
-        rest = None
+        self._own_lead_ohm, rest = knowledge.own_lead_of_ports, None
         if knowledge.rest_ratio is not None:
             rest = self._read_near(knowledge.rest_ratio, in_order=False).ports
             self._partial.keep_as_rest()
@@ -139,6 +139,13 @@ class PortReader:
         )
 
     def _read_near(self, ratio: Float, *, in_order: bool) -> NearPorts:
+        """What the near ends show, as if all lines had the nominal lead."""
+        near = self._read_as_is(ratio, in_order=in_order)
+        if self._own_lead_ohm is None:
+            return near
+        return near._replace(ports=near.ports.without(self._own_lead_ohm))
+
+    def _read_as_is(self, ratio: Float, *, in_order: bool) -> NearPorts:
         """Currents by the near ends, less what lines that charge add, if readings may show that.
 
         Two things make the readings of a cell disagree: noise, which changes from frame to frame,

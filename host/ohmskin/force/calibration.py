@@ -21,6 +21,8 @@ lead_std_ohm                               standard deviation of the lead [ohm];
 curve_top_wire_ohm                         the wires that the curves are of [ohm], if others were
 curve_bottom_wire_ohm                      learned since the presses; absent or null: those above
 curve_lead_ohm
+own_lead_ohm             R + C             what the leads of rows, then of columns, have above that
+                                           [ohm]; absent or null: nothing that is known
 indenter_area_m2                           what the skin was pressed with [m^2]; null: anything, by
                                            the total force on the skin, so there is no pressure
 rest.date                                  ISO 8601
@@ -56,7 +58,14 @@ from numpy.typing import NDArray
 from ohmskin.arrays import Bool, Float
 from ohmskin.circuit.configurations import READINGS_PER_CELL, is_near
 from ohmskin.estimate.base import Estimate, in_series
-from ohmskin.estimate.knowledge import NO_WIRES, WIRE_FIELDS, SkinKnowledge, WireOhm, check_ratio
+from ohmskin.estimate.knowledge import (
+    NO_WIRES,
+    WIRE_FIELDS,
+    SkinKnowledge,
+    WireOhm,
+    check_own_leads,
+    check_ratio,
+)
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
 from ohmskin.files import PathName, naming, read_bounded, whole_file
 from ohmskin.force.curve import ForceModel, require
@@ -142,6 +151,7 @@ class Calibration:
     mode: which readings the scans hold, a name of the enum `mode`.
     geometry: where the cells are; None: nobody has said so.
     largest_force_n: the largest force that the skin was pressed with [N]; None: not known.
+    own_lead_ohm: what single leads have above the nominal one (`SkinKnowledge`); None: not known.
     """
 
     unit_id: int
@@ -155,6 +165,7 @@ class Calibration:
     mode: str = "near"
     geometry: Geometry | None = None
     largest_force_n: float | None = None
+    own_lead_ohm: Float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.unit_id < UNIT_IDS:
@@ -175,6 +186,8 @@ class Calibration:
             if number is not None and not (np.isfinite(number) and number > 0):
                 raise ValueError(f"{name} is {number}, it must be above 0")
         self.nominal_wire_ohm.check()
+        if self.own_lead_ohm is not None:
+            check_own_leads(self.own_lead_ohm, *shape)
 
     @property
     def rows(self) -> int:
@@ -265,6 +278,8 @@ class Calibration:
         for name in (*_OWN, *_ABOVE_0, "rows", "columns"):
             content[name] = getattr(self, name)
         content |= dict(zip(WIRE_FIELDS, self.nominal_wire_ohm, strict=True))
+        if self.own_lead_ohm is not None:
+            content["own_lead_ohm"] = self.own_lead_ohm
         for name in _RESTS:
             rest = getattr(self, name)
             content[name] = None if rest is None else vars(rest) | {"ratio": _null(rest.ratio)}
@@ -349,13 +364,14 @@ def _from_content(content: Any) -> Calibration:
     # Older files have no mode, no leads, no largest force, and one deviation for both layers.
     of_both = content.pop("wire_log_std", None)
     absent = dict.fromkeys(WIRE_FIELDS[2:]) | dict.fromkeys(WIRE_FIELDS[3:5], of_both)
-    absent |= {"mode": "near", "geometry": None, "largest_force_n": None}
+    absent |= {"mode": "near", "geometry": None, "largest_force_n": None, "own_lead_ohm": None}
     content = absent | content
     numbers = (*_ABOVE_0, *WIRE_FIELDS)  # each may be null
-    names = {"format", "schema", "rows", "columns", "geometry"}
+    names = {"format", "schema", "rows", "columns", "geometry", "own_lead_ohm"}
     names |= {*_OWN, *numbers, *_RESTS, *_MODEL_FIELDS}
     _require_fields(content, names)
     shape = tuple(_value(name, content[name], int) for name in ("rows", "columns"))
+    own = content["own_lead_ohm"]
     model = ForceModel(**{name: _array(name, content[name], shape) for name in _MODEL_FIELDS})
     area_m2, largest_n, *wires = (
         None if content[name] is None else _value(name, content[name], float) for name in numbers
@@ -367,6 +383,7 @@ def _from_content(content: Any) -> Calibration:
         model=model,
         indenter_area_m2=area_m2,
         largest_force_n=largest_n,
+        own_lead_ohm=None if own is None else _array("own_lead_ohm", own, (sum(shape),)),
         nominal_wire_ohm=WireOhm(*wires),
         geometry=None if content["geometry"] is None else _geometry(content["geometry"], *shape),
     )

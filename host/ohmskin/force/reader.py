@@ -160,9 +160,11 @@ class _SharedKnowledge:
 
     def knowledge(self, rest: Rest | Untouched | None) -> SkinKnowledge:
         """What a method is told of the skin, with this rest."""
-        wires = NO_WIRES if self.calibration is None else self.calibration.nominal_wire_ohm
+        wires, own = NO_WIRES, None
+        if self.calibration is not None:
+            wires, own = self.calibration.nominal_wire_ohm, self.calibration.own_lead_ohm
         ratio = None if rest is None else rest.ratio
-        return SkinKnowledge.of(self.board, ratio, wires, self._ref_log_std)
+        return SkinKnowledge.of(self.board, ratio, wires, self._ref_log_std, own)
 
 
 class SkinReader:

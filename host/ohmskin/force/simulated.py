@@ -65,13 +65,14 @@ class SimulatedSkin:
             wires = WireOhm(*wires[6:], *wires[3:6])
         told = (wires.top, TOP_WIRE_OHM), (wires.bottom, BOTTOM_WIRE_OHM), (wires.lead, LEAD_OHM)
         top, bottom, lead = (usual if known is None else known for known, usual in told)
+        own = 0.0 if calibration.own_lead_ohm is None else calibration.own_lead_ohm
         drawn = Scene("rest", rows, columns, seed=seed).rest
         self._rest = replace(
             drawn,
             cell_siemens=calibration.untouched.level,
             top_wire_ohm=drawn.top_wire_ohm * top / TOP_WIRE_OHM,
             bottom_wire_ohm=drawn.bottom_wire_ohm * bottom / BOTTOM_WIRE_OHM,
-            lead_ohm=np.full(rows + columns, lead),
+            lead_ohm=np.maximum(lead + own + np.zeros(rows + columns), 0.0),
         )
         self._model, self._number = calibration.model, 0
         self._settings = BoardSettings(rows, columns, calibration.mode, None, calibration.unit_id)
