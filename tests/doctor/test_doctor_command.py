@@ -231,6 +231,16 @@ def test_a_calibration_of_another_skin_takes_no_wires(run: Run, tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("benches")
+def test_leads_that_a_calibration_has_found_are_named(run: Run, tmp_path: Path) -> None:
+    path, own_ohm = tmp_path / "skin.json", np.zeros(16)
+    own_ohm[[3, 8]] = 1500.0, -70.0
+    told = calibration(Scene("rest", 8, 8).rest_ratio)
+    replace(told, own_lead_ohm=own_ohm).save(path)
+    done = well(run("doctor", "emulator://8x8", "--calibration", str(path)))
+    named = f"leads unlike the others': row 3 +1500 ohm, column 0 -70 ohm, by the presses of {path}"
+    assert named in done.out
+
+
 def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path: Path) -> None:
     path, told = tmp_path / "skin.json", calibration(Scene("rest", 8, 8).rest_ratio)
     for wire_ohm, more, names in (

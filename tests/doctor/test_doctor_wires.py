@@ -73,8 +73,13 @@ def sound(rows: int, columns: int) -> Evidence:
     return evidence(f"emulator://{rows}x{columns}", told=TOLD, settled=None)
 
 
-def read_of(skin: Skin, noise_lsb: float = 0.0, seed: int = 0) -> Evidence:
-    """What a sound board with this noise reads of a skin, untouched and then pressed."""
+def read_of(
+    skin: Skin, noise_lsb: float = 0.0, seed: int = 0, own_lead_ohm: Float | None = None
+) -> Evidence:
+    """What a sound board with this noise reads of a skin, untouched and then pressed.
+
+    own_lead_ohm: what is told of single leads.
+    """
     random = np.random.default_rng(seed)
     read = sound(*skin.shape)
 
@@ -82,7 +87,7 @@ def read_of(skin: Skin, noise_lsb: float = 0.0, seed: int = 0) -> Evidence:
         return quantise(ratio + noise_lsb / 1024 * random.standard_normal(ratio.shape))
 
     rest = readings(skin)
-    presses = CornerScans(read.board)
+    presses = CornerScans(read.board, own_lead_ohm)
     for time in np.linspace(0, 1, HELD):
         for ratio in both_pressed(skin, time=time):
             presses.take(Scan(codes(ratio), 0, 0, 0.0, 0))
@@ -118,6 +123,18 @@ def test_nominal_wires_are_no_finding(size: str) -> None:
         assert "times nominal" in said["wires"]
         assert len(said["wires_of_lines"]) == 2
         assert verdict(diagnosis) == "sound: nothing is wrong"
+
+
+def test_a_lead_that_a_calibration_knows_is_no_finding() -> None:
+    """2 kohm more at the last column, beside two corners. Who does not know them is told so."""
+    own_ohm = np.zeros(16)
+    own_ohm[15] = 2000.0
+    skin = worn("8x8", 1.0, 0)
+    skin = replace(skin, lead_ohm=skin.lead_ohm + own_ohm)
+    [finding] = examine(read_of(skin, 0.3)).findings
+    assert finding.kind is Kind.WIRES
+    assert finding.place.columns == (15 - 8,)
+    assert examine(read_of(skin, 0.3, own_lead_ohm=own_ohm)).findings == []
 
 
 @pytest.mark.parametrize("told", [0.5, 1.0, 2.0])

@@ -13,7 +13,7 @@ from typer import Option
 import ohmskin
 from ohmskin import errors
 from ohmskin.cli import doctor_words as words
-from ohmskin.cli.board import Leads, Port, Wires, wires_of
+from ohmskin.cli.board import Leads, Port, Wires, own_leads_in_words, wires_of
 from ohmskin.cli.terminal import Terminal
 from ohmskin.doctor.examine import examine, measured_wires
 from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, Severity
@@ -52,7 +52,7 @@ def doctor(
     """
     paths = filter(None, (calibration, into))
     known = [load_calibration(path) for path in paths]  # the first one tells the wires
-    told = wires_of(wires, leads)
+    told, own_lead_ohm = wires_of(wires, leads), known[0].own_lead_ohm if known else None
     if known:  # what is told now has no deviation of what was told before
         before = known[0].nominal_wire_ohm
         if told.lead is None:
@@ -75,13 +75,15 @@ def doctor(
                     raise ValueError(
                         "in mode near, --into needs --press, and nominal wires, as --wires 100,200"
                     )
-                evidence = gather(device, report, told, press=press)
+                evidence = gather(device, report, told, own_lead_ohm=own_lead_ohm, press=press)
             diagnosis = examine(evidence)
     page = as_object(port, diagnosis)
     if as_json:
         print(json.dumps(page, default=asdict))  # noqa: T201
     else:
         print_page(page)
+        if own_leads := own_leads_in_words(known[0]) if known else "":
+            _out.print(f"{own_leads}, by the presses of {calibration or into}")
     if into is not None:
         _keep_wires(diagnosis, told, into)
     if not diagnosis.sound:

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from enum import Enum, auto
 from typing import Any, Final
 
+from ohmskin.arrays import Float
 from ohmskin.doctor.examine import Evidence
 from ohmskin.doctor.signal import FAR_S, LEAST_SCANS, NOISE_S, REST_S, SETTLED_S, Look, second_look
 from ohmskin.doctor.wires import CornerScans
@@ -51,6 +52,7 @@ def gather(
     report: Report = lambda step, detail: None,
     told: WireOhm = NO_WIRES,
     *,
+    own_lead_ohm: Float | None = None,
     press: bool = False,
     seconds: float = REST_S,
     clocks: bool = False,
@@ -59,6 +61,7 @@ def gather(
 
     report: is told each step before it is done, and each scan while somebody presses.
     told: what is told of wires and leads.
+    own_lead_ohm: what single leads have above that (`SkinKnowledge`).
     press: whether somebody is asked to press corners.
     seconds: how long the first look takes.
     clocks: whether to scan by each ADC clock, too. Only plates have this done.
@@ -70,14 +73,20 @@ def gather(
     if not board.is_complete:
         with suppress(CommandRefused), put_back(device):  # a recording stays as it is
             device.configure(rows=board.rows, columns=board.columns, rate_hz=0, mode="near")
-            return gather(device, report, told, press=press, seconds=seconds, clocks=clocks)
+            return gather(
+                *(device, report, told),
+                own_lead_ohm=own_lead_ohm,
+                press=press,
+                seconds=seconds,
+                clocks=clocks,
+            )
     device.only_unit = board.unit_id  # findings are of one board
     evidence = Evidence(board)
     # Wires without resistance cannot have changed: there is nothing to compare with.
     is_nominal = told.both is not None and all(told.both)
     evidence.told = told if is_nominal else told._replace(top=None, bottom=None)
     evidence.latency = None if "://" in path else latency_timer(path)
-    presses = CornerScans(board) if press else None
+    presses = CornerScans(board, own_lead_ohm) if press else None
     try:
         report(Step.SELF_TEST, None)
         with suppress(CommandRefused):  # a recording has none

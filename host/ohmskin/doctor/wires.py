@@ -163,13 +163,14 @@ class CornerScans:
     :raises ValueError: a skin of one row or column has no rectangle.
     """
 
-    def __init__(self, board: Hello) -> None:
+    def __init__(self, board: Hello, own_lead_ohm: Float | None = None) -> None:
+        """own_lead_ohm: what single leads have above the nominal one (`SkinKnowledge`)."""
         self.wanted = suggested_corners(board.rows, board.columns)
         self.pressed: tuple[Cell, ...] = ()
         self.read: list[Corners] = []
         self.hold = False
         self._board = board
-        self._matrix = make_estimator("matrix", SkinKnowledge.of(board))
+        self._matrix = make_estimator("matrix", SkinKnowledge.of(board, own_lead_ohm=own_lead_ohm))
         self._codes: defaultdict[Corners, list[Float]] = defaultdict(list)
 
     @property
