@@ -118,8 +118,9 @@ WRONGLY_TOLD: Final = 0.01
 
 # Lines unlike the others.
 # A line is odd if its lead or its segments differ from others' by so many deviations. Chosen: lines
-# of sound skins differ by 3 at most, and a lead of 600 ohm at lines of 100 ohm a segment by 7.
-ODD_STDS: Final = 5.0
+# of sound skins differ by 3 at most, a row whose cells conduct half as much by 4.4, and a lead of
+# 600 ohm at lines of 100 ohm a segment by 7.
+ODD_STDS: Final = 5.5
 # So many cells of it must have been pressed. Chosen: an odd contact or two are no odd line.
 LEAST_CELLS: Final = 3
 # At most this share of the lines is told to have a lead of its own. Chosen: what a quarter has is
