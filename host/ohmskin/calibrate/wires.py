@@ -47,9 +47,9 @@ alone, and the prior of r divides it: what is above the usual r is taken for the
 covariance of p is that of least squares. Layers that were told, and leads, are tried as told and as
 never told, and the most probable of these is the answer (`WRONGLY_TOLD`).
 
-After a fit, the line is sought that is the most unlike the others (`_PressFit.oddest_line`). What
-its lead has above theirs is taken off the readings of its ports, and all is fitted again, until no
-lead is odd.
+After a fit, the line is sought that is the most unlike the others (`_PressFit.oddest_line`). All is
+fitted again with the lead that this line would have. If that is much more probable, the lead is
+kept, and the next such line is sought.
 """
 
 from dataclasses import dataclass, replace
@@ -65,8 +65,7 @@ from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.skin import wire_coupling_ohm
 from ohmskin.circuit.small import one_blas_thread, solve_positive
 from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, SkinKnowledge, WireOhm
-from ohmskin.estimate.port_currents import PortCurrents
-from ohmskin.estimate.port_readings import PortReader
+from ohmskin.estimate.port_readings import PortReader, PortReadings
 from ohmskin.estimate.prior import (
     HIGHEST_TOUCH_SIEMENS,
     LAYER_STD,
@@ -117,10 +116,13 @@ UNCLEAR_LOG: Final = 0.5
 WRONGLY_TOLD: Final = 0.01
 
 # Lines unlike the others.
-# A line is odd if its lead or its segments differ from others' by so many deviations. Chosen: lines
-# of sound skins differ by 3 at most, a row whose cells conduct half as much by 4.4, and a lead of
-# 600 ohm at lines of 100 ohm a segment by 7.
-ODD_STDS: Final = 5.5
+# A line is suspect if its lead or its segments differ from others' by so many deviations. Chosen:
+# as on sound skins, at most. A lead that is odd passes for scatter, so it is not far off either.
+SUSPECT_STDS: Final = 3.0
+# A lead is odd if the fit with it is as much more probable as by so many deviations, and a stripe
+# if it is so many deviations off. Chosen: a row whose cells conduct half as much is not odd, and a
+# lead of 600 ohm at lines of 100 ohm a segment is.
+ODD_STDS: Final = 5.0
 # So many cells of it must have been pressed. Chosen: an odd contact or two are no odd line.
 LEAST_CELLS: Final = 3
 # At most this share of the lines is told to have a lead of its own. Chosen: what a quarter has is
@@ -196,7 +198,7 @@ class FoundWires:
     presses: int
     unclear: tuple[str, ...]
     own_lead_ohm: Float | None = None
-    odd_stripe: "LineExcess | None" = None
+    odd_stripe: LineExcess | None = None
 
     @property
     def disagrees(self) -> bool:
@@ -261,16 +263,26 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
 
     Raises ValueError where no scan shows a press.
     """
+    assert knowledge.rest_ratio is not None
     shape = knowledge.rows, knowledge.columns
+    rest = PortReader(knowledge).read(knowledge.rest_ratio)
+    rows = _rows(readings, rest.current.ravel())
     own_ohm = np.zeros(sum(shape))
-    for left in reversed(range(1 + int(ODD_LINES * own_ohm.size))):
-        fit, best = _best_fit(knowledge, readings, own_ohm)
+    fit, best = _best_fit(knowledge, rows, rest, own_ohm)
+    for _ in range(int(ODD_LINES * own_ohm.size)):
         odd = fit.oddest_line(best)
-        if odd is None or not odd.is_lead or not left:
+        if odd is None or not odd.is_lead:
             break
-        own_ohm[odd.line] += odd.ohm
+        more_ohm = own_ohm.copy()
+        more_ohm[odd.line] += odd.ohm
+        with_lead = _best_fit(knowledge, rows, rest, more_ohm)
+        if best.score - with_lead[1].score < ODD_STDS**2:
+            break
+        own_ohm, (fit, best) = more_ohm, with_lead
+    odd = fit.oddest_line(best)
+    is_stripe = odd is not None and not odd.is_lead and abs(odd.stds) > ODD_STDS
     if knowledge.own_lead_ohm is not None:  # it has been taken off these readings
-        own_ohm += knowledge.own_lead_ohm
+        own_ohm = own_ohm + knowledge.own_lead_ohm
     p, std = best.p, np.sqrt(best.covariance.diagonal())
     top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
     lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
@@ -282,22 +294,17 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
         np.unique(readings.press).size,
         unclear_layers(p[:2], std[:2], shape),
         own_ohm if own_ohm.any() else None,
-        None if odd is None or odd.is_lead else odd,
+        odd if is_stripe else None,
     )
 
 
 def _best_fit(
-    knowledge: SkinKnowledge, readings: PressReadings, own_ohm: Float
-) -> tuple["_PressFit", "_Best"]:
-    """The most probable fit, where single leads have so much above the others (R+C,) [ohm]."""
-    assert knowledge.rest_ratio is not None
-    read = PortReader(knowledge).read(knowledge.rest_ratio)
-    of_ports = np.add.outer(own_ohm[: knowledge.rows], own_ohm[knowledge.rows :])
-    rest = PortCurrents(read.current, read.current_std).without(of_ports)
-    of_presses = PortCurrents(readings.current, readings.current_std)
-    pressed = of_presses.without(of_ports.flat[readings.cells])
-    readings = readings._replace(current=pressed.current, current_std=pressed.std)
-    rows = _rows(readings, rest.current.ravel())
+    knowledge: SkinKnowledge, rows: _Rows, rest: PortReadings, own_ohm: Float
+) -> tuple["_PressFit", _Best]:
+    """The most probable fit, where single leads have so much above the others (R+C,) [ohm].
+
+    rest: readings of the untouched skin.
+    """
     told = knowledge.nominal_wire_ohm
     lead_alone = WireOhm(lead=told.lead, lead_std_ohm=told.lead_std_ohm)
     layers_alone = told._replace(lead=None, lead_std_ohm=None)
@@ -307,10 +314,10 @@ def _best_fit(
     tried = []
     for wires, cost in costs.items():
         known = replace(knowledge, nominal_wire_ohm=wires)
-        fit = _PressFit(known, rows, rest.current.ravel(), rest.std.ravel())
-        tried += [(cost + found.score, fit, found) for found in map(fit.minimised, STARTS_OHM)]
-    _, fit, best = min(tried, key=lambda one: one[0])
-    return fit, best
+        fit = _PressFit(known, rows, rest, own_ohm)
+        for found in map(fit.minimised, STARTS_OHM):
+            tried.append((fit, found._replace(score=cost + found.score)))
+    return min(tried, key=lambda one: one[1].score)
 
 
 def unclear_layers(logs: Float, stds: Float, shape: tuple[int, int]) -> tuple[str, ...]:
@@ -361,13 +368,18 @@ class _PressFit:
     """Fits wires and law to the rows of presses."""
 
     def __init__(
-        self, knowledge: SkinKnowledge, rows: _Rows, rest_current: Float, rest_std: Float
+        self, knowledge: SkinKnowledge, rows: _Rows, rest: PortReadings, own_ohm: Float
     ) -> None:
-        self._shape, self._ref_ohm = (knowledge.rows, knowledge.columns), knowledge.ref_ohm
-        self._rows, self._rest_current, self._rest_std = rows, rest_current, rest_std
+        """rest: readings of the untouched skin. own_ohm: of the leads, above the mean (R+C,)."""
+        self._shape, self._rows = (knowledge.rows, knowledge.columns), rows
+        rest_current = self._rest_current = rest.current.ravel()
+        self._rest_std = rest.current_std.ravel()
+        # Of each port, without mean leads.
+        own_of_ports = np.add.outer(own_ohm[: knowledge.rows], own_ohm[knowledge.rows :])
+        self._ref_ohm = knowledge.ref_ohm + own_of_ports.ravel()
         self._x = rows.log_force - rows.log_force.mean()
         self._bend = self._x**2 - np.mean(self._x**2)
-        level = rest_level(rest_current.reshape(self._shape), self._ref_ohm)
+        level = rest_level(rest_current.reshape(self._shape), knowledge.ref_ohm)
         # Cells of an open line have no slopes to speak of: to fit them would not end.
         self._is_open = rest_current < OPEN_SHARE * np.median(rest_current)
         self._log_siemens = np.full(rest_current.size, np.log(level))
@@ -429,7 +441,7 @@ class _PressFit:
         bottom[0] += of_lead
         of_path = wire_coupling_ohm(top, bottom, self._shape)[np.ix_(self._cells, self._cells)]
         cells = self._rows.cells
-        rest_ohm = net.port_ohm[cells] + series_ohm
+        rest_ohm = net.port_ohm[cells] + series_ohm[cells]
         return _Trial(rest_ohm, net.own_slope[cells], net.cell_volt[cells, cells], of_path)
 
     def _expected(self, p: Float) -> _Expected:
@@ -528,7 +540,7 @@ class _PressFit:
             ohm = float(slope @ residual) / square
             odd.append(LineExcess(line, ohm, ohm * square**0.5, is_lead))
         oddest = max(odd, key=lambda one: abs(one.stds), default=None)
-        return oddest if oddest is not None and abs(oddest.stds) > ODD_STDS else None
+        return oddest if oddest is not None and abs(oddest.stds) > SUSPECT_STDS else None
 
     def _start(self, start_ohm: float) -> Float:
         """p with these wires, and the level of the law by the median row."""
