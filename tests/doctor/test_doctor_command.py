@@ -241,6 +241,18 @@ def test_leads_that_a_calibration_has_found_are_named(run: Run, tmp_path: Path) 
     assert named in done.out
 
 
+@pytest.mark.usefixtures("benches")
+def test_corners_at_a_lead_that_a_calibration_has_found_are_sound(run: Run, tmp_path: Path) -> None:
+    path, url = tmp_path / "skin.json", "emulator://8x8?scene=corners&crimp_column=5&crimp_ohm=2000"
+    told = calibration(Scene("rest", 8, 8).rest_ratio)
+    own_ohm = np.zeros(16)
+    for own_ohm[13], names in ((0.0, ["wires"]), (2000.0, [])):
+        replace(told, own_lead_ohm=own_ohm).save(path)
+        done = run("doctor", url, "--calibration", str(path), "--press", "--json")
+        assert [each["id"] for each in json.loads(done.out)["findings"]] == names
+
+
+@pytest.mark.usefixtures("benches")
 def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path: Path) -> None:
     path, told = tmp_path / "skin.json", calibration(Scene("rest", 8, 8).rest_ratio)
     for wire_ohm, more, names in (
