@@ -13,6 +13,8 @@ from calibrations import half_doubtful, of_scene
 from command_line import Run, assert_one_line, well
 from ohmskin.force.calibration import load_calibration
 from ohmskin.force.reader import SkinReader
+from recordings import write_recording
+from stepped import stepped
 
 GHOST = "emulator://8x8?scene=ghost&begin=0&seed=1"
 REST = "emulator://8x8?seed=1"
@@ -189,3 +191,11 @@ def test_a_replay_ends_with_a_picture_of_its_last_scan(run: Run, tmp_path: Path)
     for method in ("none", "ohm"):
         said = well(run("stream", f"replay://{out}?speed=0", "--method", method)).out
         assert re.findall(r"scan (\d+) ", said) == ["0", "49"]
+
+
+def test_a_replay_of_no_scan_says_so(run: Run, tmp_path: Path) -> None:
+    """It printed nothing, and ended as if all had been shown."""
+    write_recording(tmp_path / "a.mcap", stepped("emulator://4x4").info, [])
+    for more in ((), ("--json",)):
+        done = run("stream", f"replay://{tmp_path / 'a.mcap'}", *more)
+        assert_one_line(done, "a.mcap: no scan in it")

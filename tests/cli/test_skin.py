@@ -59,6 +59,7 @@ def test_it_says_what_is_known_of_the_wires(file: Path, run: Run) -> None:
             WireOhm(100.0, 200.0, 80.0, 0.1, 0.02, 30.0),
             "wires of 100 +- 10 (top) and 200 +- 4 (bottom) ohm a segment, leads of 80 +- 30 ohm",
         ),
+        (WireOhm(100.0, 200.0, 10.0, 0.1, 0.02, 900.0), "leads of up to 1810 ohm"),
     ):
         replace(load_calibration(file), nominal_wire_ohm=wires).save(file)
         assert words in " ".join(well(run("skin", str(file))).out.split())

@@ -81,7 +81,10 @@ def _wires_in_words(wires: WireOhm) -> str:
 
     top = known(wires.top, (wires.top or 0.0) * (wires.top_log_std or 0.0))
     bottom = known(wires.bottom, (wires.bottom or 0.0) * (wires.bottom_log_std or 0.0))
-    lead = known(wires.lead, wires.lead_std_ohm or 0.0)
+    lead_ohm, lead_std_ohm = wires.lead, wires.lead_std_ohm or 0.0
+    lead = known(lead_ohm, lead_std_ohm)
+    if lead_ohm is not None and lead_ohm < lead_std_ohm:  # no lead is below 0
+        lead = f"up to {lead_ohm + 2 * lead_std_ohm:.0f}"
     return f"wires of {top} (top) and {bottom} (bottom) ohm a segment, leads of {lead} ohm"
 
 

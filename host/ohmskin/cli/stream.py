@@ -109,6 +109,8 @@ def stream(
             else:
                 _show_scans(skin, reader, given)
     lost = skin.stats
+    if isinstance(skin, Replay) and not lost.scans:
+        raise ValueError(f"{skin.name}: no scan in it")
     if lost.missed or lost.line.damaged or lost.restarts:
         text = f"missed {lost.missed} scans ({lost.dropped_by_board} dropped by the board), "
         text += f"{lost.line.damaged} damaged frames, {lost.restarts} restarts"
