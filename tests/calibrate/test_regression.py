@@ -236,6 +236,24 @@ def test_one_odd_cell_does_not_spoil_the_others() -> None:
     np.testing.assert_array_equal(np.isnan(std), [[False, True]])
 
 
+def test_a_cell_whose_presses_do_not_foresee_each_other_has_a_gain() -> None:
+    """One of its presses alone shows a rise. It counted as a cell without presses, and -1 cells
+    were said to have a gain.
+    """
+    rise, force_n = presses(10, 21)
+    shown = np.array([-1, -1.1, -1, -1.2, -1, -1.1, -1, -1.05, 3, 3.1]) * rise.max() / 3
+    weak_n = np.array([1, 1, 1.2, 1.1, 1, 1.3, 1.1, 1, 3, 3.2])
+    found = ForceRegression().fit(
+        [1] * 10 + [0] * 10,
+        np.concatenate([rise, shown]),
+        np.concatenate([force_n, weak_n]),
+        shape=(1, 3),
+        press=np.arange(20) // 2,
+    )
+    np.testing.assert_array_equal(found.model_.pooled, [[False, False, True]])
+    assert found.message_.startswith("1 of 3 cells take the curve of all presses, with their own")
+
+
 def test_rows_of_one_press_are_held_out_together() -> None:
     """Each press is off by its own offset: rows held out one by one would not show it."""
     random = np.random.default_rng(15)

@@ -11,7 +11,6 @@ import pytest
 
 import ohmskin
 from network import SkinCircuit
-from ohmskin.arrays import Float
 from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.tables import PRESS
 from ohmskin.calibrate.wires import FoundWires, PressReadings, find_wires
@@ -39,13 +38,11 @@ def found_by(
     seed: int = 0,
     series_ohm: float = 250.0,
     series_scatter: float = 0.0,
-    known_ohm: Float | None = None,
 ) -> FoundWires:
     """From presses of these cells, each by all forces: a power law with a resistance in series.
 
     scatter: of what a cell conducts under any force, and a sixth of it of each press.
     series_scatter: of the resistance in series, from cell to cell.
-    known_ohm: what is known of single leads.
     """
     random = np.random.default_rng(seed)
     circuit, rest = SkinCircuit(of), of.cell_siemens
@@ -63,15 +60,12 @@ def found_by(
             currents.append(current_from_ratio(ratio, REF_OHM, REF_OHM).flat[cell])
     pressed = np.repeat(cells, FORCES_N.size)
     rest_ratio = circuit.readings(rest)[..., :4]
-    knowledge = SkinKnowledge(
-        *of.shape, rest_ratio=rest_ratio, nominal_wire_ohm=told, own_lead_ohm=known_ohm
-    )
-    taken_off = 0.0 if known_ohm is None else knowledge.own_lead_of_ports.flat[pressed]
+    knowledge = SkinKnowledge(*of.shape, rest_ratio=rest_ratio, nominal_wire_ohm=told)
     readings = PressReadings(
         pressed,
         np.arange(len(currents)),
         np.tile(FORCES_N, len(cells)),
-        1 / (1 / np.array(currents) - taken_off),
+        np.array(currents),
         np.full(len(currents), 1e-9),
     )
     return find_wires(knowledge, readings)
@@ -141,15 +135,6 @@ def test_several_leads_unlike_the_others_are_found() -> None:
     assert np.flatnonzero(found.own_lead_ohm).tolist() == [1, 8]
     np.testing.assert_allclose(found.own_lead_ohm[[1, 8]], (2500, 1200), rtol=0.2)
     np.testing.assert_allclose(found.wires.both, (100, 200), rtol=0.15)
-
-
-def test_a_lead_that_is_known_stays() -> None:
-    """Readings from which it has been taken show no other."""
-    known_ohm = np.zeros(12)
-    known_ohm[2] = 1500.0
-    of = with_own_lead(skin((6, 6), 100.0, 200.0), 2, 1500.0)
-    found = found_by(of, WireOhm(), list(range(36)), 0.1, known_ohm=known_ohm)
-    np.testing.assert_array_equal(found.own_lead_ohm, known_ohm)
 
 
 @pytest.mark.parametrize(("line", "more"), [(3, 3.0), (7, 2.0)])

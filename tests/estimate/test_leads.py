@@ -245,6 +245,21 @@ def test_what_a_lead_has_above_the_others_is_taken_off_all_readings() -> None:
     assert not np.allclose(*answers["ohm"], rtol=1e-3)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_chi_square_counts_what_a_lead_has_above_the_others(method: str) -> None:
+    """The model has no such leads, and the readings have: a perfect answer had chi-square 50."""
+    own_ohm = np.zeros(16)
+    own_ohm[3] = 2000.0
+    rest = skin_at_rest(8, 8, np.random.default_rng(5), wire_ohm=(100.0, 200.0))
+    siemens = rest.cell_siemens.copy()
+    siemens[[3, 3, 5], [4, 6, 4]] += 2e-4
+    crimped = replace(rest, lead_ohm=own_ohm)
+    given = trial_of(crimped, [replace(crimped, cell_siemens=siemens)]).rounded(10)
+    known = replace(given.knowledge(0), own_lead_ohm=own_ohm)
+    assert make_estimator(method, known).estimate(given.ratio[0]).chi2 < 2.0
+    assert make_estimator("ohm", known).estimate(given.ratio[0]).chi2 < 2.0  # it takes off none
+
+
 @pytest.mark.parametrize("own_ohm", [np.zeros(8), np.full(9, np.nan), np.full(9, 1e30)])
 def test_leads_that_cannot_be_are_refused(own_ohm: Float) -> None:
     with pytest.raises(ValueError, match="own_lead_ohm must be 9 numbers"):

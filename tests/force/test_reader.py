@@ -202,6 +202,17 @@ def taught(scans: int = 30) -> tuple[SkinReader, list[Scan]]:
     return reader, [replace(scan, codes=quantise(ratio, 10)) for ratio in trial.ratio]
 
 
+def test_a_skin_that_is_not_connected_is_no_rest_for_a_method_without_deviations() -> None:
+    """`lsq` states none, and took it."""
+    bench = stepped("emulator://2x2?seed=1")
+    reader = SkinReader(bench.info, method="lsq")
+    (scan,) = islice(bench, 1)
+    reader.tare(scan.ratio, force=True)
+    unplugged = np.where(scan.ratio > 0.5, 1023.5 / 1024, 0.5 / 1024)
+    with pytest.raises(TareRefused, match="connect the skin"):
+        reader.tare(unplugged)
+
+
 @pytest.mark.parametrize("method", ["joint", "voltage"])
 def test_a_skin_that_is_not_connected_is_no_rest(method: str) -> None:
     """The tare was taken, and after that, all 64 cells of the skin were touched."""

@@ -195,7 +195,8 @@ def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
     """The curves that cells have of their own, by flat index.
 
     A cell has none if it was pressed less than `MIN_PRESSES` times, if its forces or its rises are
-    all the same, or if its force falls with its rise.
+    all the same, or if its force falls with its rise. Nor has it one that its presses do not
+    foresee: where some of them are held out, the others may show no rise.
     """
     trials = {}
     for cell in np.unique(rows.cell).tolist():
@@ -208,7 +209,11 @@ def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
     gains = np.concatenate([[], *(trial.gain_of_growing() for trial in trials.values())])
     grows = _is_clear(gains, SCATTER_ERRORS)
     curves = {cell: trial.best(grows) for cell, trial in trials.items()}
-    return {cell: curve for cell, curve in curves.items() if curve is not None}
+    return {
+        cell: curve
+        for cell, curve in curves.items()
+        if curve is not None and not np.isnan(curve.residual_std)
+    }
 
 
 def fit_line(x: Float, force: Float, v: Float | float = 1.0) -> Curve | None:

@@ -250,7 +250,7 @@ class TotalFit:
         near = np.convolve(pressed, np.ones(2 * NEAR_SCANS + 1), "same") > 0
         self._pressed, self._ends = pressed[scan], near[scan] & ~pressed[scan]
         is_weighed = np.bincount(self._of_row, minlength=self._groups) > 0
-        self._is_press = is_weighed & (np.bincount(number, totals.press >= 0) > 0)
+        self._is_press = is_weighed & (np.bincount(number, pressed) > 0)
 
     def _contact(self) -> tuple[Float, Float, Float]:
         """log(x' / x0), and its slopes by log x and by c, each (n, C)."""
@@ -340,8 +340,7 @@ class TotalFit:
         parts = self._parts(log_contact)
         slopes = [np.ones_like(parts), log_contact, b * by_series, b * self._turn]
         columns = [(parts * slope).sum(axis=1) for slope in slopes]
-        columns.insert(4, totals.margin)
-        shown = self._shown(np.column_stack([*columns, parts, parts * log_contact]))
+        shown = self._shown(np.column_stack([*columns, totals.margin, parts, parts * log_contact]))
         self.total_n_ = shown[:, 0] + v * shown[:, 4]
         by_delay = np.zeros((totals.shown_n.size, 0))
         if totals.lags:

@@ -130,9 +130,9 @@ LEAST_CELLS: Final = 3
 ODD_LINES: Final = 0.25
 
 # The search.
-# Both layers start from these [ohm]. Chosen: from wires that are too small, it finds larger ones;
-# the others are for minima that nobody has seen.
-STARTS_OHM: Final = (50.0, 1000.0)
+# Both layers start from this [ohm]. Chosen: from wires that are too small, it finds larger ones, up
+# to 10 kOhm in `benchmarks/bench_newtons.py`.
+START_OHM: Final = 50.0
 # Fits, each with the scatter by the one before. Chosen: a fifth moves wires by less than 1 %.
 ROUNDS: Final = 4
 # Newton steps for the untouched cells of a trial, which starts from those of the one before, and
@@ -269,8 +269,8 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     rows = _rows(readings, rest.current.ravel())
     own_ohm = np.zeros(sum(shape))
     fit, best = _best_fit(knowledge, rows, rest, own_ohm)
+    odd = fit.oddest_line(best)
     for _ in range(int(ODD_LINES * own_ohm.size)):
-        odd = fit.oddest_line(best)
         if odd is None or not odd.is_lead:
             break
         more_ohm = own_ohm.copy()
@@ -279,10 +279,8 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
         if best.score - with_lead[1].score < ODD_STDS**2:
             break
         own_ohm, (fit, best) = more_ohm, with_lead
-    odd = fit.oddest_line(best)
+        odd = fit.oddest_line(best)
     is_stripe = odd is not None and not odd.is_lead and abs(odd.stds) > ODD_STDS
-    if knowledge.own_lead_ohm is not None:  # it has been taken off these readings
-        own_ohm = own_ohm + knowledge.own_lead_ohm
     p, std = best.p, np.sqrt(best.covariance.diagonal())
     top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
     lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
@@ -315,8 +313,8 @@ def _best_fit(
     for wires, cost in costs.items():
         known = replace(knowledge, nominal_wire_ohm=wires)
         fit = _PressFit(known, rows, rest, own_ohm)
-        for found in map(fit.minimised, STARTS_OHM):
-            tried.append((fit, found._replace(score=cost + found.score)))
+        found = fit.minimised()
+        tried.append((fit, found._replace(score=cost + found.score)))
     return min(tried, key=lambda one: one[1].score)
 
 
@@ -483,11 +481,11 @@ class _PressFit:
 
     # ----------------------------------------------------------------------------- the search
 
-    def minimised(self, start_ohm: float) -> _Best:
-        """The fit that starts from segments of `start_ohm`, both layers alike."""
+    def minimised(self) -> _Best:
+        """The most probable p and v."""
         from scipy.optimize import least_squares
 
-        p, scatter = self._start(start_ohm), SCATTER
+        p, scatter = self._start(), SCATTER
         for _ in range(ROUNDS):
             whitener = self._whitener(self._expected(p), scatter)
             found = least_squares(
@@ -542,10 +540,10 @@ class _PressFit:
         oddest = max(odd, key=lambda one: abs(one.stds), default=None)
         return oddest if oddest is not None and abs(oddest.stds) > SUSPECT_STDS else None
 
-    def _start(self, start_ohm: float) -> Float:
-        """p with these wires, and the level of the law by the median row."""
+    def _start(self) -> Float:
+        """p with the wires of the start, and the level of the law by the median row."""
         p = self._centre.copy()
-        p[:2] = np.log(start_ohm)
+        p[:2] = np.log(START_OHM)
         for _ in range(_REST_STEPS):
             model = self._expected(p)
             off = (self._rows.y - model.y) / np.maximum(model.by_contact, 0.1)

@@ -71,7 +71,7 @@ def doctor(
                 if device.info.mode == "far":
                     if press:
                         raise ValueError("mode far shows the wires untouched: leave out --press")
-                elif into is not None and not (press and told.both):
+                elif into is not None and not (press and told.both and all(told.both)):
                     raise ValueError(
                         "in mode near, --into needs --press, and nominal wires, as --wires 100,200"
                     )

@@ -74,7 +74,9 @@ def gather(
         with suppress(CommandRefused), put_back(device):  # a recording stays as it is
             device.configure(rows=board.rows, columns=board.columns, rate_hz=0, mode="near")
             return gather(
-                *(device, report, told),
+                device,
+                report,
+                told,
                 own_lead_ohm=own_lead_ohm,
                 press=press,
                 seconds=seconds,

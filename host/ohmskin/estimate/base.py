@@ -297,6 +297,9 @@ class Estimator(ABC):
         if knowledge.checked_names != NEAR or ports.region is not None:
             off = ((ports.current - current_siemens) / ports.current_std).ravel()[ports.region]
             return float(off.ravel() @ off.ravel()) / off.size
+        own_ohm = knowledge.own_lead_of_ports
+        if self.takes_leads and own_ohm is not None:  # the readings have them, and the model not
+            current_siemens = current_siemens / (1.0 + current_siemens * own_ohm)
         references = knowledge.ref_top_ohm, knowledge.ref_bottom_ohm
         model = ratio_from_current(current_siemens, *references)
         residual = ((ports.ratio - model) / knowledge.ratio_std).ravel()

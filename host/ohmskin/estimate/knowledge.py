@@ -269,14 +269,15 @@ class SkinKnowledge:
         own_lead_ohm: Float | None = None,
     ) -> Self:
         """What is known of the skin at this board."""
-        size, references = (board.rows, board.columns), (board.ref_top_ohm, board.ref_bottom_ohm)
-        told, names = (rest_ratio, nominal_wire_ohm), MODES[board.mode]
         return cls(
-            *size,
-            *references,
+            board.rows,
+            board.columns,
+            board.ref_top_ohm,
+            board.ref_bottom_ohm,
             board.adc_bits,
-            *told,
-            names,
+            rest_ratio,
+            nominal_wire_ohm,
+            MODES[board.mode],
             ref_log_std=ref_log_std,
             own_lead_ohm=own_lead_ohm,
         )

@@ -189,8 +189,8 @@ class LinePairs:
         """
         if self._ports < 3:
             return False
-        most = self._alike_frames.max()  # at least 1 after a frame: a line is like itself
-        is_wanted = most == 0 or most >= ALIKE_FRAMES
+        is_first = not self._alike_frames[0, 0]  # after a frame, a line has been like itself
+        is_wanted = is_first or (self._alike_frames[self._each_pair] >= ALIKE_FRAMES).any()
         return bool(is_wanted or np.count_nonzero(high) >= 2 or np.count_nonzero(touched) >= 2)
 
     def compare(self, now: PortCurrents) -> bool:

@@ -83,7 +83,7 @@ MAX_FILE_BYTES: Final = 4_000_000
 # No number of a file is larger. Chosen: it is far beyond any force, time or conductance in any
 # unit, and beyond the slope of any power law in siemens; yet sums of its square do not overflow.
 MAX_NUMBER: Final = 1e60
-# What a touch may be in place of what the curve gives, in deviations: none is further off.
+# So many deviations from what the curve gives a touch is tried, and none is further off.
 _OPEN_STDS: Final = np.linspace(-4.0, 4.0, 41)
 # Forces beyond those of the presses are less probable by this power. Chosen: of 2 to 6, it errs
 # least on simulated skins, and by little more where later touches are half as hard again.
@@ -298,7 +298,7 @@ def _likely(force_n: Float, std_n: Float, largest_n: float) -> tuple[Float, Floa
     """`Calibration.forces` of n touched cells, each (n,), by sums over q."""
     log_std = np.log1p(_OPEN_STDS[-1] * std_n / force_n) / _OPEN_STDS[-1]
     q = force_n[:, None] * np.exp(log_std[:, None] * _OPEN_STDS)
-    prior = np.minimum(largest_n / np.maximum(q, largest_n), 1.0) ** _BEYOND_POWER
+    prior = (largest_n / np.maximum(q, largest_n)) ** _BEYOND_POWER
     share = prior * np.exp(-0.5 * _OPEN_STDS**2)
     share /= share.sum(axis=1, keepdims=True)
     likely_n = np.minimum((share * q).sum(axis=1), force_n)

@@ -205,6 +205,7 @@ class SkinReader:
     def another(self) -> SkinReader:
         """A reader of the same skin, with the same tares, for another way of reading its scans."""
         other = copy(self)  # both have the same `_shared`
+        other.focus = None  # one reader steers the regions of a board
         other._begin()
         return other
 
@@ -290,8 +291,9 @@ class SkinReader:
             remedy = "take everything off the skin; if nothing is on it: ohmskin tare --force"
             raise TareRefused(touched_cells(estimate.touched), remedy)
         if self.rest is not None and not force:
-            # By deviations less: a rest may be too small to be measured.
-            open_level = _OPEN_SHARE * estimator.rest_level() - 2 * estimate.level_std
+            # By deviations less, where known: a rest may be too small to be measured.
+            level_std = np.nan_to_num(estimate.level_std)
+            open_level = _OPEN_SHARE * estimator.rest_level() - 2 * level_std
             if np.mean(estimate.level < open_level) > 0.5:
                 text = f"most cells conduct less than {_OPEN_SHARE:.0%} of what they did at rest"
                 remedy = "connect the skin; if it is connected: ohmskin tare --force"
@@ -458,10 +460,6 @@ class CalibratedSkin(Closing):
         self._reader.warm_up()
         self._lock = threading.Lock()  # a reader takes one scan at a time, and in their order
 
-    def new_reader(self) -> SkinReader:
-        """A reader of this skin for another way of reading its scans; it knows the same tares."""
-        return self._reader.another()
-
     if not TYPE_CHECKING:  # a type checker would take any name for an attribute
 
         def __getattr__(self, name: str) -> object:
@@ -500,7 +498,7 @@ class CalibratedSkin(Closing):
         With `focus`, scans of regions that have waited for `LATE_S` are passed over, and counted in
         `missed` of the next one: a region must not follow contacts of long ago.
         """
-        reader = self.new_reader()
+        reader = self._reader.another()
         reader.focus = self._focus
         return self._read_by(reader, iter(self.device))
 

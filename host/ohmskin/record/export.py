@@ -48,7 +48,8 @@ class Stacks(ExitStack):
     def add(self, rows: Mapping[str, NDArray[Any]]) -> None:
         """Add rows (n, ...) to each of these arrays, by name; always of the same type and shape."""
         for name, array in rows.items():
-            if self._first.setdefault(name, array) is array:
+            if name not in self._files:
+                self._first[name] = array
                 self._files[name] = self.enter_context(self._new())
             self._files[name].write(array.tobytes())
 
