@@ -253,6 +253,27 @@ def test_corners_at_a_lead_that_a_calibration_has_found_are_sound(run: Run, tmp_
 
 
 @pytest.mark.usefixtures("benches")
+@pytest.mark.parametrize("now_ohm", [4000, 6000])
+def test_a_lead_that_got_worse_is_not_kept_as_wires_of_all_lines(
+    run: Run, tmp_path: Path, now_ohm: float
+) -> None:
+    """Both rectangles differ, so their mean is nobody's: it was written, and said to be sound."""
+    path, own_ohm = tmp_path / "skin.json", np.zeros(8)
+    own_ohm[2] = 1500.0
+    told = replace(calibration(Scene("rest", 4, 4).rest_ratio), own_lead_ohm=own_ohm)
+    told.save(path)
+    before = path.read_bytes()
+    url = f"emulator://4x4?scene=corners&crimp_row=2&crimp_ohm={now_ohm}"
+    asked = ("doctor", url, "--press", "--calibration", str(path), "--leads", "80")
+    done = run(*asked)
+    assert done.code == 1
+    assert "wires               not known: the lines that were pressed differ: look at" in done.out
+    done = run(*asked, "--into", str(path))
+    assert done.err.endswith("is as it was: neither presses nor far ends have told the wires\n")
+    assert path.read_bytes() == before
+
+
+@pytest.mark.usefixtures("benches")
 def test_presses_are_compared_with_the_wires_of_a_calibration(run: Run, tmp_path: Path) -> None:
     path, told = tmp_path / "skin.json", calibration(Scene("rest", 8, 8).rest_ratio)
     for wire_ohm, more, names in (

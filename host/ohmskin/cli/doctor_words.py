@@ -19,6 +19,7 @@ MOST_CELLS: Final = 6
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
+_LINES_DIFFER: Final = "not known: the lines that were pressed differ: look at their crimps, calibrate anew"
 _WIDE: Final = "not known: tell --leads, or press with what is smaller than a cell, further apart"
 
 
@@ -137,7 +138,7 @@ def _times(share: WireShare) -> str:
 
 def _ohm(share: WireShare, nominal_ohm: tuple[float, float]) -> str:
     if not share.known:
-        return _WIDE
+        return _LINES_DIFFER if share.std <= KNOWN_STD * share.share else _WIDE
     top, bottom = (f"{share.share * ohm:.0f}" for ohm in nominal_ohm)
     return f"{_times(share)}: top {top}, bottom {bottom} ohm a segment, if both changed alike"
 

@@ -48,6 +48,7 @@ larger than S says, the deviation of y is widened.
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import permutations
 from typing import Final
 
@@ -280,7 +281,7 @@ def shares_of(measured: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
     measured: row and column of the corner between the others, y, and the deviation of y.
 
     All wires together are the mean by precision. If this mean explains each of them, only the mean
-    can be a finding; if not, only single rows and columns can.
+    can be a finding; if not, only single rows and columns can, and the mean is not known.
     """
     if not measured:
         return []
@@ -296,7 +297,8 @@ def shares_of(measured: Sequence[tuple[Cell, float, float]]) -> list[WireShare]:
         return WireShare(place, share, share * log_std, is_known, differs)
 
     lines = [share_at(Place((i,), (j,)), y, std, not alike) for (i, j), y, std in measured]
-    return [share_at(WHOLE_SKIN, mean, mean_std, alike), *lines]
+    whole = share_at(WHOLE_SKIN, mean, mean_std, alike)
+    return [replace(whole, known=whole.known and alike), *lines]
 
 
 def _pressed_fit(
