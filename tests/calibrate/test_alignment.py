@@ -259,7 +259,7 @@ LOG = ForceLog(TIME_S, FORCE_N)
 @pytest.mark.parametrize(
     ("time_s", "rise", "log", "words"),
     [
-        (TIME_S[:1], FORCE_N[:1], LOG, "the skin's rise lasts 0 s, 15 s are needed"),
+        (TIME_S[:1], FORCE_N[:1], LOG, "the skin's rise lasts 0 s, 15 s are needed: record longer"),
         (TIME_S, np.where(TIME_S == 0.02, np.nan, 1.0), LOG, "scan 1: its rise is not finite"),
         (
             np.where(TIME_S == 0.04, 0.02, TIME_S),

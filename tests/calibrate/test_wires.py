@@ -127,14 +127,17 @@ def test_a_lead_unlike_the_others_is_found(line: int, own_ohm: float) -> None:
     np.testing.assert_allclose(found.wires.both, (100, 200), rtol=0.15)
 
 
-def test_several_leads_unlike_the_others_are_found() -> None:
-    """Of two, the second one is seen when the first one has been taken off."""
-    of = with_own_lead(with_own_lead(skin((6, 6), 100.0, 200.0), 1, 2500.0), 8, 1200.0)
-    found = found_by(of, WireOhm(), list(range(36)), 0.1)
+@pytest.mark.parametrize("size", [4, 6])
+def test_several_leads_unlike_the_others_are_found(size: int) -> None:
+    """On 4x4, one of two explains too little to be believed by itself: neither was found."""
+    row, column = 1, size + 2
+    of = with_own_lead(skin((size, size), 100.0, 200.0), row, 2500.0)
+    of = with_own_lead(of, column, 1500.0)
+    found = found_by(of, WireOhm(), list(range(size**2)), 0.1)
     assert found.own_lead_ohm is not None
-    assert np.flatnonzero(found.own_lead_ohm).tolist() == [1, 8]
-    np.testing.assert_allclose(found.own_lead_ohm[[1, 8]], (2500, 1200), rtol=0.2)
-    np.testing.assert_allclose(found.wires.both, (100, 200), rtol=0.15)
+    assert np.flatnonzero(found.own_lead_ohm).tolist() == [row, column]
+    np.testing.assert_allclose(found.own_lead_ohm[[row, column]], (2500, 1500), rtol=0.2)
+    np.testing.assert_allclose(found.wires.both, (100, 200), rtol=0.25, atol=40.0)
 
 
 @pytest.mark.parametrize(("line", "more"), [(3, 3.0), (7, 2.0)])

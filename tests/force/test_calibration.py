@@ -298,7 +298,7 @@ def test_edited_files_are_refused_by_field(
     ("raw", "reason"),
     [
         (b"", "no calibration file: "),
-        (b"\x89PNG\r\n\x1a\n", "no calibration file: "),
+        (b"\x89PNG\r\n\x1a\n", "no calibration file: it is no text"),
         (b"[" * 100_000, "no calibration file: "),
         (b'{"unit_id": 1, "a": {"b": 1, "b": 2}}', "no calibration file: field 'b' stands twice"),
         (b'{"a": ' + b"9" * 5000 + b"}", "no calibration file: "),

@@ -121,7 +121,9 @@ def _edges(time_s: Float, values: Float, name: str) -> tuple[Float, Bool]:
 
     span_s = float(time_s[-1] - time_s[0])
     if span_s < MIN_OVERLAP_S:
-        raise ValueError(f"{name} lasts {span_s:.3g} s, {MIN_OVERLAP_S:g} s are needed")
+        raise ValueError(
+            f"{name} lasts {span_s:.3g} s, {MIN_OVERLAP_S:g} s are needed: record longer"
+        )
     if span_s > MAX_SPAN_S:
         span = f"{name} lasts {span_s / 3600:.1f} h, more than 6"
         raise ValueError(f"{span}: are its times in seconds? If so, cut it into parts")

@@ -48,8 +48,8 @@ covariance of p is that of least squares. Layers that were told, and leads, are 
 never told, and the most probable of these is the answer (`WRONGLY_TOLD`).
 
 After a fit, the line is sought that is the most unlike the others (`_PressFit.oddest_line`). All is
-fitted again with the lead that this line would have. If that is much more probable, the lead is
-kept, and the next such line is sought.
+fitted again with the lead that this line would have, and the next such line is sought. Leads are
+kept if all is much more probable with them.
 """
 
 from dataclasses import dataclass, replace
@@ -119,9 +119,9 @@ WRONGLY_TOLD: Final = 0.01
 # A line is suspect if its lead or its segments differ from others' by so many deviations. Chosen:
 # as on sound skins, at most. A lead that is odd passes for scatter, so it is not far off either.
 SUSPECT_STDS: Final = 3.0
-# A lead is odd if the fit with it is as much more probable as by so many deviations, and a stripe
-# if it is so many deviations off. Chosen: a row whose cells conduct half as much is not odd, and a
-# lead of 600 ohm at lines of 100 ohm a segment is.
+# Leads are odd if the fit with them is as much more probable as by so many deviations each, and a
+# stripe if it is so many deviations off. Chosen: a row whose cells conduct half as much is not odd,
+# and a lead of 600 ohm at lines of 100 ohm a segment is.
 ODD_STDS: Final = 5.0
 # So many cells of it must have been pressed. Chosen: an odd contact or two are no odd line.
 LEAST_CELLS: Final = 3
@@ -267,19 +267,20 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     shape = knowledge.rows, knowledge.columns
     rest = PortReader(knowledge).read(knowledge.rest_ratio)
     rows = _rows(readings, rest.current.ravel())
-    own_ohm = np.zeros(sum(shape))
-    fit, best = _best_fit(knowledge, rows, rest, own_ohm)
-    odd = fit.oddest_line(best)
-    for _ in range(int(ODD_LINES * own_ohm.size)):
+    own_ohm = trial_ohm = np.zeros(sum(shape))
+    fit, best = trial_fit, trial = _best_fit(knowledge, rows, rest, own_ohm)
+    even_score = best.score
+    # One odd lead hides another. So the next one is sought even before the first one is clear.
+    for count in range(1, 1 + int(ODD_LINES * own_ohm.size)):
+        odd = trial_fit.oddest_line(trial)
         if odd is None or not odd.is_lead:
             break
-        more_ohm = own_ohm.copy()
-        more_ohm[odd.line] += odd.ohm
-        with_lead = _best_fit(knowledge, rows, rest, more_ohm)
-        if best.score - with_lead[1].score < ODD_STDS**2:
-            break
-        own_ohm, (fit, best) = more_ohm, with_lead
-        odd = fit.oddest_line(best)
+        trial_ohm = trial_ohm.copy()
+        trial_ohm[odd.line] += odd.ohm
+        trial_fit, trial = _best_fit(knowledge, rows, rest, trial_ohm)
+        if even_score - trial.score > count * ODD_STDS**2:
+            own_ohm, fit, best = trial_ohm, trial_fit, trial
+    odd = fit.oddest_line(best)
     is_stripe = odd is not None and not odd.is_lead and abs(odd.stds) > ODD_STDS
     p, std = best.p, np.sqrt(best.covariance.diagonal())
     top_ohm, bottom_ohm = np.exp(p[:2]).tolist()

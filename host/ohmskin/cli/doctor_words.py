@@ -19,7 +19,9 @@ MOST_CELLS: Final = 6
 _TABLES: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _UNTOUCHED: Final = "not known: an untouched skin hides its wires, --press asks for touches"
 _NOT_PRESSED: Final = "not known: no three corners of a rectangle were pressed"
-_LINES_DIFFER: Final = "not known: the lines that were pressed differ: look at their crimps, calibrate anew"
+_LINES_DIFFER: Final = (
+    "not known: the lines that were pressed differ: look at their crimps, calibrate anew"
+)
 _WIDE: Final = "not known: tell --leads, or press with what is smaller than a cell, further apart"
 
 

@@ -341,6 +341,8 @@ def load_calibration(path: PathName) -> Calibration:
         octets = read_bounded(path, MAX_FILE_BYTES)
         try:
             content = json.loads(octets, object_pairs_hook=_once)
+        except UnicodeDecodeError:
+            raise ValueError("no calibration file: it is no text") from None
         except (ValueError, RecursionError) as error:
             raise ValueError(f"no calibration file: {error}") from error
         return _from_content(content)
