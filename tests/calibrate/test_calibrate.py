@@ -139,6 +139,15 @@ def test_presses_that_far_ends_have_read(
     assert np.abs(force_n[~pressed & (true_n == 0)]).max() < 0.3
 
 
+def test_shorted_lines_are_suspected_where_two_cells_seem_pressed(run: Run, tmp_path: Path) -> None:
+    """Half of the skin got no curve of its own, and nothing said why."""
+    recording, out = str(tmp_path / "a.mcap"), str(tmp_path / "skin.json")
+    url = "emulator://3x3?scene=presses&rate=20&speed=0&short_rows=1,2"
+    well(run("record", url, recording, "--force-port", "truth", "--seconds", "40"))
+    said = well(run("calibrate", "recording", recording, out, "--indenter-mm2", "80")).out
+    assert "two cells were pressed; if nobody did so, lines may be shorted: ohmskin doctor" in said
+
+
 def test_other_methods_refuse_what_far_ends_have_read(
     run: Run, presses: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:

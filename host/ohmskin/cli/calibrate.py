@@ -262,6 +262,7 @@ def recording(
     )
     if presses.shared:
         note += f"\n{presses.shared} scans left out: two cells were pressed"
+        note += "; if nobody did so, lines may be shorted: ohmskin doctor tells"
     _finish(calibrator, presses, recording, out, note)
 
 

@@ -147,13 +147,13 @@ class FullFit:
         self._prior = self._prior.about(self._means)
         self._centre, self._variance = self._prior.normal(self.log_cells)
 
-    def _weighted(self, slopes: Float, scale: float = 1.0) -> Float:
+    def _weighted(self, slopes: Float) -> Float:
         """Slopes of h from those of rho, (RC, ...), which are overwritten.
 
         h = weight / (rho + series): rho is the port resistance, series the references and leads. So
         dh / d rho is -weight times the modelled current squared.
         """
-        slopes *= (-scale * self._weight * self._modelled**2)[:, None]
+        slopes *= (-self._weight * self._modelled**2)[:, None]
         return slopes
 
     def _linearise(self) -> None:

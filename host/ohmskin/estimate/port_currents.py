@@ -202,13 +202,13 @@ class FarReadings(NamedTuple):
     ports: u and its standard deviation.
     near_current: I, but at least its deviation by rounding, because losses are divided by it (R, C)
         [S].
-    is_dead: ports whose near ends show no current, as of an open line: far ends show nothing of
-        their wires (R, C).
     drop: what the wires of row and of column lose, p_r I and p_c I, (2, R, C) [V/Vdd]. The near end
         is computed from I, so that lines that charge do not matter.
     read_drop: the same, but the near end is taken as it was read, so that the values of the
         references do not matter.
     ends: e and f, or a and b where no far end is sensed, (2, R, C) [V/Vdd].
+    is_dead: ports whose near ends show no current, as of an open line: far ends show nothing of
+        their wires (R, C).
     """
 
     ports: PortCurrents
