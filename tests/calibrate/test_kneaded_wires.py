@@ -20,7 +20,10 @@ from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 
 SHAPE, PRESSES, STEP_S, PERIOD_S = (4, 5), 160, 0.02, 0.6
-TOP_SEGMENTS, BOTTOM_SEGMENTS = (n.ravel() + 1 for n in np.indices(SHAPE)[::-1])
+ROW, COLUMN = np.indices(SHAPE).reshape(2, -1)
+TOP_SEGMENTS, BOTTOM_SEGMENTS = COLUMN + 1, ROW + 1
+LEADS = np.vstack([np.arange(4)[:, None] == ROW, np.arange(5)[:, None] == COLUMN])  # of each cell
+EVEN = np.zeros(9)
 
 
 @dataclass
@@ -35,6 +38,7 @@ class Skin:
     bottom_ohm: float
     noise: float = 0.02
     siemens_at_1n: float = 4e-5
+    own_lead_ohm: Float = field(default_factory=lambda: EVEN)
     believed: list[tuple[float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -49,7 +53,9 @@ class Skin:
         wave = np.where(is_pressed, np.sin(np.pi * phase_s / 0.4), 0.0)
         force_n = peaks_n[number.astype(int)] * wave[:, None]
         siemens = self.siemens_at_1n * np.exp(0.15 * random.standard_normal(cells)) * force_n**1.5
-        self._rise = self._behind(siemens, self.top_ohm, self.bottom_ohm)
+        self._rise = siemens / (
+            1 + siemens * self._path(self.top_ohm, self.bottom_ohm, self.own_lead_ohm)
+        )
         factors = 1 + self.noise * random.standard_normal(PRESSES)
         total_n = force_n.sum(axis=1) * factors[number.astype(int)]
         self._shown_s = np.arange(0.5, self._time_s[-1], 0.1)
@@ -57,22 +63,21 @@ class Skin:
         self._shown_n += 0.01 * random.standard_normal(self._shown_s.size)
 
     @staticmethod
-    def _behind(siemens: Float, top_ohm: float, bottom_ohm: float) -> Float:
-        path_ohm = TOP_SEGMENTS * top_ohm + BOTTOM_SEGMENTS * bottom_ohm
-        return np.asarray(siemens / (1 + siemens * path_ohm))
+    def _path(top_ohm: float, bottom_ohm: float, own_ohm: Float) -> Float:
+        return np.asarray(TOP_SEGMENTS * top_ohm + BOTTOM_SEGMENTS * bottom_ohm + own_ohm @ LEADS)
 
-    def seen(self, top_ohm: float, bottom_ohm: float) -> Float:
+    def seen(self, top_ohm: float, bottom_ohm: float, own_ohm: Float) -> Float:
         """What an estimator that believes these wires sees of the contacts [S]."""
-        path_ohm = TOP_SEGMENTS * top_ohm + BOTTOM_SEGMENTS * bottom_ohm
+        path_ohm = self._path(top_ohm, bottom_ohm, own_ohm)
         return np.asarray(self._rise / np.maximum(1 - self._rise * path_ohm, 0.02))
 
-    def show(self, wires: WireOhm, most_cells: int) -> Shown:
+    def show(self, wires: WireOhm, own_ohm: Float, most_cells: int) -> Shown:
         assert most_cells >= 60_000
         both = wires.top or 150.0, wires.bottom or 150.0  # such scans teach nothing of wires
         self.believed.append(both)
-        rise = self.seen(*both)
-        segments = np.array([TOP_SEGMENTS, BOTTOM_SEGMENTS])[:, None, :]
-        slopes = rise * segments * np.array(both)[:, None, None]
+        rise = self.seen(*both, own_ohm)
+        by_paths = [TOP_SEGMENTS * both[0], BOTTOM_SEGMENTS * both[1], *LEADS]
+        slopes = rise * np.array(by_paths)[:, None, :]
         none = np.zeros_like(self._time_s)
         of_skin = self._time_s, rise, self._press, none
         return Shown(Totals(SHAPE, *of_skin, self._shown_s, self._shown_n), slopes, wires)
@@ -81,7 +86,9 @@ class Skin:
 @pytest.mark.parametrize("ohm", [(20.0, 40.0), (100.0, 200.0), (60.0, 900.0), (1000.0, 2000.0)])
 def test_wires_are_found_from_a_start_far_away(ohm: tuple[float, float]) -> None:
     skin = Skin(*ohm)
-    found = WireSearch(NO_WIRES, SHAPE, skin.show).found().wires
+    with_leads = WireSearch(NO_WIRES, SHAPE, skin.show).found()
+    assert with_leads.own_lead_ohm is None
+    found = with_leads.wires
     assert found.both is not None
     assert found.top_log_std is not None
     assert found.bottom_log_std is not None
@@ -95,13 +102,26 @@ def test_wires_are_found_from_a_start_far_away(ohm: tuple[float, float]) -> None
     assert len(skin.believed) < 12
 
 
+@pytest.mark.parametrize(("line", "own_ohm"), [(1, 1500.0), (7, 2500.0)])
+def test_a_lead_unlike_the_others_is_found(line: int, own_ohm: float) -> None:
+    """A row's and a column's. It passed for other wires, and forces erred ten times as much."""
+    odd_ohm = EVEN.copy()
+    odd_ohm[line] = own_ohm
+    found = WireSearch(NO_WIRES, SHAPE, Skin(100.0, 200.0, own_lead_ohm=odd_ohm).show).found()
+    assert found.own_lead_ohm is not None
+    assert np.flatnonzero(found.own_lead_ohm).tolist() == [line]
+    assert found.own_lead_ohm[line] == pytest.approx(own_ohm, rel=0.3)
+    off = np.abs(np.log(np.array(found.wires.both) / (100.0, 200.0)))
+    assert (off < 2 * np.array(found.wires[3:5])).all()
+
+
 def test_a_step_that_is_too_long_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where presses told little of the wires, one step led to 1.4 kohm, and to no way back."""
     skin, usual = Skin(100.0, 200.0), TotalFit.wires
 
     def overdone(fit: TotalFit, slopes: WireSlopes) -> tuple[Float, Float]:
         change, covariance = usual(fit, slopes)
-        return 5 * change, covariance
+        return (5 if change.size == 2 else 1) * change, covariance  # of both layers
 
     monkeypatch.setattr(TotalFit, "wires", overdone)
     found = WireSearch(NO_WIRES, SHAPE, skin.show).found().wires
@@ -120,15 +140,15 @@ def test_a_step_that_was_too_long_is_not_taken_with_more_scans(
 
     def overdone(fit: TotalFit, slopes: WireSlopes) -> tuple[Float, Float]:
         change, covariance = usual(fit, slopes)
-        return 8 * change, covariance
+        return (8 if change.size == 2 else 1) * change, covariance
 
     def noted(fit: TotalFit) -> float:
         misfits.append(usual_misfit(fit))
         return misfits[-1]
 
-    def show(wires: WireOhm, most_cells: int) -> Shown:
+    def show(wires: WireOhm, own_ohm: Float, most_cells: int) -> Shown:
         cells.append(most_cells)
-        return skin.show(wires, most_cells)
+        return skin.show(wires, own_ohm, most_cells)
 
     monkeypatch.setattr(TotalFit, "wires", overdone)
     monkeypatch.setattr(TotalFit, "misfit", noted)
@@ -167,8 +187,8 @@ def test_scans_teach_wires_and_lead_before_presses_do() -> None:
     """An emulated skin had leads of 0 to 245 ohm, by which trial was the last; it has 80."""
     skin, told = Skin(100.0, 200.0, noise=0.3), []
 
-    def show(wires: WireOhm, most_cells: int) -> Shown:
-        shown = skin.show(wires, most_cells)
+    def show(wires: WireOhm, own_ohm: Float, most_cells: int) -> Shown:
+        shown = skin.show(wires, own_ohm, most_cells)
         told.append(wires)
         taught = WireOhm(120.0, 180.0, 70.0, 0.1, 0.1, 20.0)
         return shown if len(told) > 1 else shown._replace(wires=taught)
@@ -189,9 +209,9 @@ def test_scans_are_believed_that_are_sure_of_the_lead_or_of_both_layers(
 ) -> None:
     skin = Skin(100.0, 200.0)
 
-    def show(wires: WireOhm, most_cells: int) -> Shown:
+    def show(wires: WireOhm, own_ohm: Float, most_cells: int) -> Shown:
         taught = WireOhm(120.0, 180.0, 70.0, log_std, log_std, lead_std_ohm)
-        return skin.show(wires, most_cells)._replace(wires=taught)
+        return skin.show(wires, own_ohm, most_cells)._replace(wires=taught)
 
     WireSearch(NO_WIRES, SHAPE, show).found()
     assert skin.believed[1] == pytest.approx((120, 180) if is_sure else (50, 50))
@@ -214,7 +234,8 @@ def test_the_filter_of_the_scale_is_kept_near_the_wires_alone(
     assert scales[-1] is not None
     scales.clear()
     far = np.array([0.0, 5.0]), np.eye(2)  # each step is a long one
-    monkeypatch.setattr(TotalFit, "wires", lambda *_: far)
+    even = np.zeros(3), np.eye(3)  # and no lead is unlike the others
+    monkeypatch.setattr(TotalFit, "wires", lambda _, by: far if by.std.size == 2 else even)
     WireSearch(NO_WIRES, SHAPE, Skin(100.0, 200.0).show).found()
     assert set(scales) == {None}
 
@@ -224,9 +245,9 @@ def test_scans_take_no_place_of_what_was_told(told_ohm: float | None) -> None:
     """What they taught was taken for told again, which widened the prior."""
     skin, told = Skin(100.0, 200.0), WireOhm(150.0, told_ohm, top_log_std=0.05)
 
-    def show(wires: WireOhm, most_cells: int) -> Shown:
+    def show(wires: WireOhm, own_ohm: Float, most_cells: int) -> Shown:
         taught = WireOhm(900.0, 900.0, 0.0, 0.01, 0.01, 1.0)
-        return skin.show(wires, most_cells)._replace(wires=taught)
+        return skin.show(wires, own_ohm, most_cells)._replace(wires=taught)
 
     WireSearch(told, SHAPE, show).found()
     assert skin.believed[1] == pytest.approx((150, told_ohm or 50))

@@ -27,6 +27,9 @@ Without any force, the scans teach wires, too, because each touch has several ce
 sure of them (`SURE_LEAD`), and nobody has told any, these wires count as told: the search begins
 with them, and they are the prior. In the total force, a lead looks like a resistance in series with
 each contact. So the lead is what the scans teach.
+
+A loose crimp gives one line a lead that the others have not. After the first trials, each line is
+asked for its own lead, which is one more w. The oddest one is taken off, and trials go on with it.
 """
 
 from collections.abc import Callable
@@ -37,7 +40,13 @@ import numpy as np
 from ohmskin.arrays import Float
 from ohmskin.calibrate.scale import Scale
 from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
-from ohmskin.calibrate.wires import FoundWires, unclear_layers, wire_prior
+from ohmskin.calibrate.wires import (
+    ODD_LINES,
+    UNTOLD_LEAD_STD_OHM,
+    FoundWires,
+    unclear_layers,
+    wire_prior,
+)
 from ohmskin.estimate.knowledge import WireOhm
 from ohmskin.estimate.prior import LAYER_STD, USUAL_LEAD_STD_OHM
 
@@ -66,6 +75,9 @@ LIKELY: Final = 3.0
 # the most likely one, which is this share of what was held at least. Chosen: fine enough for 1 %,
 # and as far as the prior reaches.
 GRID_POINTS, GRID_STDS, LEAST_SHARE = 121, 6.0, 0.2
+# A lead is odd if it is so many deviations off. Chosen: on simulated skins without an odd one, the
+# oddest line is off by up to 1.6, and a line with a crimp of 1.5 kOhm by 4 and more.
+ODD_LEAD_STDS: Final = 3.0
 # Deviations of the logs of segments, and of the lead [ohm], that are held, in trials and in the
 # last reading. Chosen: so small that no scan teaches others.
 HELD_LOG_STD, HELD_LEAD_STD_OHM = 1e-3, 1e-3
@@ -74,7 +86,7 @@ HELD_LOG_STD, HELD_LEAD_STD_OHM = 1e-3, 1e-3
 class Shown(NamedTuple):
     """What an estimator shows of the scans that is told some wires.
 
-    slopes: how its rises follow the wires, (2, n, C), as in `WireSlopes`.
+    slopes: how its rises follow both layers and each lead, (2+R+C, n, C), as in `WireSlopes`.
     wires: these wires, with what the scans have taught.
     """
 
@@ -84,10 +96,11 @@ class Shown(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """A trial: u, the fit, L, w and the covariance of w, (2, 2)."""
+    """A trial: u, the fit, the slopes (2+R+C, n, C), L, w and the covariance of w, (2, 2)."""
 
     held: Float
     fit: TotalFit
+    slopes: Float
     misfit: float
     change: Float
     covariance: Float
@@ -109,21 +122,23 @@ class WireSearch:
     """Looks for the wires.
 
     told: what was told of them. shape: (R, C).
-    show: what an estimator shows that is told the given wires, in scans that have about so many
-        cells together at most.
+    show: what an estimator shows that is told the given wires, and what single leads have above
+        them (R+C,), in scans that have about so many cells together at most.
     """
 
     def __init__(
-        self, told: WireOhm, shape: tuple[int, int], show: Callable[[WireOhm, int], Shown]
+        self, told: WireOhm, shape: tuple[int, int], show: Callable[[WireOhm, Float, int], Shown]
     ) -> None:
         self._told, self._shape = told, shape
         self._show, self._most_cells = show, FIRST_CELLS
+        self._own_ohm = np.zeros(sum(shape))
         self._scale: Scale | None = None
 
     def found(self) -> FoundWires:
         """The wires. Raises ValueError where the force does not follow the skin."""
         start = self._taught()
         best = self._nearest(self._trial(start), SHORT_STEP, CLOSE_STDS[0])
+        best = self._with_odd_leads(best)
         # L of more scans is not to be compared with that before, nor L of another filter, which is
         # kept from the first trial near the wires on. So a step that is not short is not taken: it
         # may be one that was too far.
@@ -138,13 +153,14 @@ class WireSearch:
         lead_ohm, lead_std_ohm = self._lead
         wires = WireOhm(top_ohm, bottom_ohm, lead_ohm, top_std, bottom_std, lead_std_ohm)
         unclear = unclear_layers(u, stds, self._shape)
-        return FoundWires(wires, self._told, best.fit.presses, unclear)
+        own_ohm = self._own_ohm if self._own_ohm.any() else None
+        return FoundWires(wires, self._told, best.fit.presses, unclear, own_ohm)
 
     def _taught(self) -> Float:
         """u of the first trial. Takes the lead, and the prior, that the scans alone teach."""
         lead_ohm, lead_std_ohm = self._told.lead_or_usual(USUAL_LEAD_STD_OHM)
         told = self._told._replace(lead=lead_ohm, lead_std_ohm=lead_std_ohm)
-        taught = self._show(told, FIRST_CELLS).wires
+        taught = self._show(told, self._own_ohm, FIRST_CELLS).wires
         self._lead = taught.lead_or_usual(USUAL_LEAD_STD_OHM)
         stds = [LAYER_STD if std is None else std for std in taught[3:5]]
         is_sure = self._lead[1] < SURE_LEAD * lead_std_ohm or max(stds) < LAYER_STD
@@ -156,14 +172,42 @@ class WireSearch:
     def _trial(self, u: Float) -> _Trial:
         """A trial."""
         top_ohm, bottom_ohm = np.exp(u).tolist()
-        shown = self._show(held(WireOhm(top_ohm, bottom_ohm, self._lead[0])), self._most_cells)
+        wires = held(WireOhm(top_ohm, bottom_ohm, self._lead[0]))
+        shown = self._show(wires, self._own_ohm, self._most_cells)
         fit = TotalFit(shown.totals, self._scale, for_wires=True).fit()
         off = self._centre - u
-        by_wires = fit.wires(WireSlopes(shown.slopes, off, self._std))
-        trial = _Trial(u, fit, fit.misfit(), *by_wires)
+        by_wires = fit.wires(WireSlopes(shown.slopes[:2], off, self._std))
+        trial = _Trial(u, fit, shown.slopes, fit.misfit(), *by_wires)
         if self._most_cells == TRIAL_CELLS and trial.is_close(SHORT_STEP, 0.0):
             self._scale = fit.scale_
         return trial
+
+    def _with_odd_leads(self, best: _Trial) -> _Trial:
+        """The trial that is kept when leads that are unlike the others' have been taken off.
+
+        Slopes foresee a large lead badly, so a line that was found may be asked again.
+        """
+        for _ in range(max(2, int(ODD_LINES * self._own_ohm.size))):
+            line, ohm, stds = self._oddest_lead(best)
+            if abs(stds) < ODD_LEAD_STDS and not self._own_ohm[line]:
+                break
+            self._own_ohm = self._own_ohm.copy()
+            self._own_ohm[line] += ohm
+            best = self._nearest(self._trial(best.held), SHORT_STEP, CLOSE_STDS[0])
+        return best
+
+    def _oddest_lead(self, trial: _Trial) -> tuple[int, float, float]:
+        """The line whose lead is the most unlike the others': its number, by how much [ohm], and
+        this over its deviation.
+        """
+        found = []
+        centre = np.append(self._centre - trial.held, 0.0)
+        std = np.append(self._std, UNTOLD_LEAD_STD_OHM)
+        for line in range(sum(self._shape)):
+            of_line = WireSlopes(trial.slopes[[0, 1, 2 + line]], centre, std)
+            change, covariance = trial.fit.wires(of_line)
+            found.append((line, float(change[2]), float(change[2] / covariance[2, 2] ** 0.5)))
+        return max(found, key=lambda one: abs(one[2]))
 
     def _nearest(self, best: _Trial, short: float, stds: float) -> _Trial:
         """The last trial that is kept, of steps until they are short."""

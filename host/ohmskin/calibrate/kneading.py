@@ -137,7 +137,10 @@ class Kneading:
             calibrator.take_wires(search.found())
             # The curves are of the wires that were found, and not of what scans would teach.
             wires = held(calibrator.knowledge.nominal_wire_ohm)
-        levels = self._levels(calibrator.method, wires, self._spaced(), progress, are_sure=are_sure)
+        own_ohm = calibrator.knowledge.own_lead_ohm
+        levels = self._levels(
+            calibrator.method, wires, own_ohm, self._spaced(), progress, are_sure=are_sure
+        )
         calibrator.estimator = levels.estimator
         return TotalFit(self._totals(levels, log)).fit()
 
@@ -173,19 +176,29 @@ class Kneading:
         count = np.cumsum(np.diff(np.maximum.accumulate(press), prepend=-1) > 0) - 1
         return np.asarray(used & (count // STRETCH % (cells // most_cells + 1) == 0))
 
-    def _shown(self, log: ForceLog, progress: Progress, wires: WireOhm, most_cells: int) -> Shown:
-        """What these wires make of some stretches of presses."""
+    def _shown(
+        self, log: ForceLog, progress: Progress, wires: WireOhm, own_ohm: Float, most_cells: int
+    ) -> Shown:
+        """What these wires, and what single leads have above them, make of some presses."""
         used = self._in_stretches(log, most_cells)
-        levels = self._levels(DEFAULT_METHOD, wires, used, progress)
+        levels = self._levels(DEFAULT_METHOD, wires, own_ohm, used, progress)
         wires = levels.estimator.wires()
         return Shown(self._totals(levels, log), self._slopes(wires, levels), wires)
 
     def _levels(
-        self, method: str, wires: WireOhm, used: Bool, progress: Progress, *, are_sure: bool = False
+        self,
+        method: str,
+        wires: WireOhm,
+        own_ohm: Float | None,
+        used: Bool,
+        progress: Progress,
+        *,
+        are_sure: bool = False,
     ) -> _Levels:
         """What a method shows of the scans to use, (n,); those that it doubts are left out.
 
         wires: what is known of them. What a recording teaches of them is known in the next one.
+        own_ohm: what single leads have above the mean, (R+C,).
         are_sure: whether they are as told, and not on trial.
         """
         pressed = self._press >= 0
@@ -199,7 +212,9 @@ class Kneading:
         scans = zip(numbers, progress([self._scans[n] for n in numbers]), strict=True)
         for recording, given in groupby(scans, lambda scan: self._recording[scan[0]]):
             known = self._knowledge[recording]
-            knowledge = replace(known, nominal_wire_ohm=wires, are_wires_sure=are_sure)
+            knowledge = replace(
+                known, nominal_wire_ohm=wires, own_lead_ohm=own_ohm, are_wires_sure=are_sure
+            )
             estimator = make_estimator(method, knowledge)
             rest = rests[recording] = estimator.rest_level().ravel()
             for n, scan in given:
@@ -270,12 +285,19 @@ class Kneading:
 
     @one_blas_thread
     def _slopes(self, wires: WireOhm, levels: _Levels) -> Float:
-        """d log x / du of the module's equations, (2, n, C), of the scans that were used."""
+        """d log x / du of the module's equations, of the scans that were used, (2+R+C, n, C).
+
+        The first two are by u, the others by the lead of each line [1/ohm].
+        """
         knowledge = self._calibrator.knowledge
         assert wires.both is not None
         series_ohm = knowledge.ref_ohm + 2 * (wires.lead or 0.0)
         rises, rests = levels.rise[levels.used], levels.rest[self._recording[levels.used]]
-        slopes = np.zeros((2, *rises.shape))
+        rows, columns = np.indices(self.shape).reshape(2, -1, 1)
+        by_leads = np.hstack(
+            [rows == np.arange(self.shape[0]), columns == np.arange(self.shape[1])]
+        )
+        slopes = np.zeros((2 + sum(self.shape), *rises.shape))
         for n in np.flatnonzero(rises.any(axis=1)):
             siemens = np.maximum(rises[n] + rests[n], MIN_CELL_SIEMENS)
             circuit = PortCircuit(siemens.reshape(self.shape), *wires.both)
@@ -283,7 +305,7 @@ class Kneading:
             pressed = rises[n] > 0
             by_cells = weight * circuit.by_cell()[:, pressed]
             system = by_cells.T @ by_cells + np.eye(by_cells.shape[1]) / UNLIMITED_STD**2
-            by_wires = by_cells.T @ (weight * circuit.by_layers())
+            by_wires = by_cells.T @ (weight * np.hstack([circuit.by_layers(), by_leads]))
             log_siemens = solve_positive(system, by_wires)  # slopes of ports are those by log ohm
             slopes[:, n, pressed] = log_siemens.T * (siemens[pressed] / rises[n, pressed])
         return slopes

@@ -178,7 +178,7 @@ class Totals(NamedTuple):
 
 
 class WireSlopes(NamedTuple):
-    """How the rises follow the wires: d log x / dw, (2, n, C); prior of w, centre and std (2,)."""
+    """How the rises follow the wires: d log x / dw, (k, n, C); prior of w, centre and std (k,)."""
 
     slopes: Float
     centre: Float
@@ -413,7 +413,7 @@ class TotalFit:
     # ------------------------------------------------------------------------------ the answer
 
     def wires(self, given: WireSlopes) -> tuple[Float, Float]:
-        """The change w of the wires that fits best, (2,), and its covariance, (2, 2).
+        """The change w of the wires that fits best, (k,), and its covariance, (k, k).
 
         It is one step of Gauss-Newton of p and w together. More steps would follow the slopes to
         wires for which they do not hold.
@@ -430,8 +430,9 @@ class TotalFit:
             block_diag(np.diag(of_wires), precision),
             np.concatenate([of_wires * given.centre, pull]),
         )
-        covariance = np.asarray(np.linalg.inv(precision)[:2, :2])
-        return np.asarray(np.linalg.solve(precision, pull)[:2]), covariance
+        count = given.std.size
+        covariance = np.asarray(np.linalg.inv(precision)[:count, :count])
+        return np.asarray(np.linalg.solve(precision, pull)[:count]), covariance
 
     @property
     def presses(self) -> int:
