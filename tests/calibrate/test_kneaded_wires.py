@@ -80,7 +80,8 @@ class Skin:
         slopes = rise * np.array(by_paths)[:, None, :]
         none = np.zeros_like(self._time_s)
         of_skin = self._time_s, rise, self._press, none
-        return Shown(Totals(SHAPE, *of_skin, self._shown_s, self._shown_n), slopes, wires)
+        totals = Totals(SHAPE, *of_skin, self._shown_s, self._shown_n)
+        return Shown(totals, slopes, np.arange(rise.shape[0]), wires)
 
 
 @pytest.mark.parametrize("ohm", [(20.0, 40.0), (100.0, 200.0), (60.0, 900.0), (1000.0, 2000.0)])

@@ -36,6 +36,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.scale import Scale
@@ -86,21 +87,29 @@ HELD_LOG_STD, HELD_LEAD_STD_OHM = 1e-3, 1e-3
 class Shown(NamedTuple):
     """What an estimator shows of the scans that is told some wires.
 
-    slopes: how its rises follow both layers and each lead, (2+R+C, n, C), as in `WireSlopes`.
+    slopes: how its rises follow both layers and each lead, as in `WireSlopes`, (2+R+C, m, C).
+    scans: the m scans of these slopes; all others have none, because nothing is pressed.
     wires: these wires, with what the scans have taught.
     """
 
     totals: Totals
     slopes: Float
+    scans: NDArray[np.intp]
     wires: WireOhm
+
+    def by_wires(self, wanted: list[int]) -> Float:
+        """Slopes of all scans by these k wires, (k, n, C)."""
+        slopes = np.zeros((len(wanted), *self.totals.rise.shape))
+        slopes[:, self.scans] = self.slopes[wanted]
+        return slopes
 
 
 class _Trial(NamedTuple):
-    """A trial: u, the fit, the slopes (2+R+C, n, C), L, w and the covariance of w, (2, 2)."""
+    """A trial: u, what an estimator shows, the fit, L, w and the covariance of w, (2, 2)."""
 
     held: Float
+    shown: Shown
     fit: TotalFit
-    slopes: Float
     misfit: float
     change: Float
     covariance: Float
@@ -176,8 +185,8 @@ class WireSearch:
         shown = self._show(wires, self._own_ohm, self._most_cells)
         fit = TotalFit(shown.totals, self._scale, for_wires=True).fit()
         off = self._centre - u
-        by_wires = fit.wires(WireSlopes(shown.slopes[:2], off, self._std))
-        trial = _Trial(u, fit, shown.slopes, fit.misfit(), *by_wires)
+        by_wires = fit.wires(WireSlopes(shown.by_wires([0, 1]), off, self._std))
+        trial = _Trial(u, shown, fit, fit.misfit(), *by_wires)
         if self._most_cells == TRIAL_CELLS and trial.is_close(SHORT_STEP, 0.0):
             self._scale = fit.scale_
         return trial
@@ -204,7 +213,7 @@ class WireSearch:
         centre = np.append(self._centre - trial.held, 0.0)
         std = np.append(self._std, UNTOLD_LEAD_STD_OHM)
         for line in range(sum(self._shape)):
-            of_line = WireSlopes(trial.slopes[[0, 1, 2 + line]], centre, std)
+            of_line = WireSlopes(trial.shown.by_wires([0, 1, 2 + line]), centre, std)
             change, covariance = trial.fit.wires(of_line)
             found.append((line, float(change[2]), float(change[2] / covariance[2, 2] ** 0.5)))
         return max(found, key=lambda one: abs(one[2]))

@@ -31,6 +31,7 @@ from itertools import groupby
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.kneaded_wires import Shown, WireSearch, held
@@ -183,7 +184,7 @@ class Kneading:
         used = self._in_stretches(log, most_cells)
         levels = self._levels(DEFAULT_METHOD, wires, own_ohm, used, progress)
         wires = levels.estimator.wires()
-        return Shown(self._totals(levels, log), self._slopes(wires, levels), wires)
+        return Shown(self._totals(levels, log), *self._slopes(wires, levels), wires)
 
     def _levels(
         self,
@@ -284,8 +285,8 @@ class Kneading:
         return np.asarray(np.sum(near & ~on, axis=(1, 2)), dtype=np.float64)
 
     @one_blas_thread
-    def _slopes(self, wires: WireOhm, levels: _Levels) -> Float:
-        """d log x / du of the module's equations, of the scans that were used, (2+R+C, n, C).
+    def _slopes(self, wires: WireOhm, levels: _Levels) -> tuple[Float, NDArray[np.intp]]:
+        """d log x / du of the module's equations, (2+R+C, m, C), and its scans of those used, (m,).
 
         The first two are by u, the others by the lead of each line [1/ohm].
         """
@@ -297,8 +298,9 @@ class Kneading:
         by_leads = np.hstack(
             [rows == np.arange(self.shape[0]), columns == np.arange(self.shape[1])]
         )
-        slopes = np.zeros((2 + sum(self.shape), *rises.shape))
-        for n in np.flatnonzero(rises.any(axis=1)):
+        scans = np.flatnonzero(rises.any(axis=1))
+        slopes = np.zeros((2 + sum(self.shape), scans.size, rises.shape[1]))
+        for number, n in enumerate(scans):
             siemens = np.maximum(rises[n] + rests[n], MIN_CELL_SIEMENS)
             circuit = PortCircuit(siemens.reshape(self.shape), *wires.both)
             weight = (circuit.port_ohm + series_ohm)[:, None] ** -2.0 / knowledge.current_std
@@ -307,5 +309,5 @@ class Kneading:
             system = by_cells.T @ by_cells + np.eye(by_cells.shape[1]) / UNLIMITED_STD**2
             by_wires = by_cells.T @ (weight * np.hstack([circuit.by_layers(), by_leads]))
             log_siemens = solve_positive(system, by_wires)  # slopes of ports are those by log ohm
-            slopes[:, n, pressed] = log_siemens.T * (siemens[pressed] / rises[n, pressed])
-        return slopes
+            slopes[:, number, pressed] = log_siemens.T * (siemens[pressed] / rises[n, pressed])
+        return slopes, scans
