@@ -83,7 +83,7 @@ MAX_FILE_BYTES: Final = 4_000_000
 # No number of a file is larger. Chosen: it is far beyond any force, time or conductance in any
 # unit, and beyond the slope of any power law in siemens; yet sums of its square do not overflow.
 MAX_NUMBER: Final = 1e60
-# So many deviations from what the curve gives a touch is tried, and none is further off.
+# A touch is taken to be within these deviations of what the curve gives.
 _OPEN_STDS: Final = np.linspace(-4.0, 4.0, 41)
 # Forces beyond those of the presses are less probable by this power. Chosen: of 2 to 6, it errs
 # least on simulated skins, and by little more where later touches are half as hard again.
