@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can go wrong between a program and a board. Every text says what to do."""
 
+from typing import Self
+
 
 class OhmskinError(Exception):
     """Any of the errors below. Bad arguments are `ValueError` instead.
@@ -49,6 +51,10 @@ class CommandRefused(OhmskinError):
         super().__init__(f"the board refused '{command}': {result}: {reason}")
         self.command = command
         self.result = result
+        self._told = command, result, reason
+
+    def __reduce__(self) -> tuple[type[Self], tuple[str, str, str]]:
+        return type(self), self._told  # else the one text would be taken for the three
 
 
 class TareRefused(OhmskinError):

@@ -75,7 +75,7 @@ class LiveSkin(Closing):
         force: bool = False,
         every: bool = True,
     ) -> None:
-        self.port = os.fspath(port)
+        self.port = os.fsdecode(port)
         self.failure: Exception | None = None
         """Why there are no scans now; None while they come, and before the port was first tried."""
         self.skipped = 0
@@ -86,7 +86,8 @@ class LiveSkin(Closing):
         self.ended = False
         """Whether the thread has ended: with its recording, by `close`, or by a defect of ours."""
         self.watchers: set[Callable[[], None]] = set()
-        """They are called when there is news, from the thread that reads: they must not wait."""
+        """They are called when there is news, from the thread that reads: they must not wait. One
+        that raises an error is not called again, and the log has the error."""
         self.closing = threading.Event()
         """Is set when `close` is called."""
         self._calibration = None if calibration is None else loaded(calibration)
@@ -218,7 +219,11 @@ class LiveSkin(Closing):
         with self._changed:
             self._changed.notify_all()
         for watcher in tuple(self.watchers):
-            watcher()
+            try:
+                watcher()
+            except Exception:  # of a program: the skin and the other watchers go on
+                LOG.exception("%s: a watcher failed, and is not called any more", self.port)
+                self.watchers.discard(watcher)
 
     def _read(self) -> None:
         """Open the port, and take its scans until `close`. Raises what its device raises."""
@@ -261,8 +266,10 @@ class LiveSkin(Closing):
 
     def close(self) -> None:
         """End reading. May be called again."""
-        self.closing.set()
-        self._tell()  # at once: the thread may never end
+        if not self.closing.is_set():
+            self.closing.set()
+            self._tell()  # at once: the thread may never end
         if (device := self._device) is not None:
             device.close()
-        self._thread.join(_CLOSE_S)
+        if threading.current_thread() is not self._thread:  # a watcher closes the skin
+            self._thread.join(_CLOSE_S)

@@ -72,7 +72,7 @@ def open(
     # The file first: a board may take seconds to boot, and a wrong file is known at once.
     of_skin = None if calibration is None else loaded(calibration)
     with ExitStack() as opened:
-        device = opened.enter_context(_device(os.fspath(url)))
+        device = opened.enter_context(_device(os.fsdecode(url)))
         skin = (
             device if of_skin is None else CalibratedSkin(device, of_skin, force=force, focus=focus)
         )

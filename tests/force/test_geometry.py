@@ -11,8 +11,9 @@ import pytest
 
 import ohmskin
 from calibrations import of_scene
+from ohmskin.arrays import Float
 from ohmskin.force.calibration import load_calibration
-from ohmskin.force.geometry import Geometry
+from ohmskin.force.geometry import KINDS, Geometry
 from ohmskin.force.reader import SkinReader
 from stepped import stepped
 
@@ -133,6 +134,45 @@ def test_a_net_force_has_the_weak_edge_of_a_touch(tmp_path: Path) -> None:
     assert scan.wrench[0] == pytest.approx([0, 0, -1], abs=0.03)
 
 
+def test_a_wrench_of_many_scans_is_that_of_each() -> None:
+    """They were summed over scans and rows."""
+    table = np.random.default_rng(0).uniform(-1, 1, (2, 2, 3, 3))
+    placed = Geometry("table", "f", 2, 3, dict(zip(KINDS["table"], table, strict=True)))
+    force_n = np.arange(24.0).reshape(4, 2, 3)
+    force_n[0, 0, 0], force_n[1] = np.nan, np.nan
+    together = placed.wrench(force_n)
+    for number in range(4):
+        net_n, torque_nm = np.zeros(3), np.zeros(3)
+        for cell in np.ndindex(2, 3):
+            if number == 1 or np.isfinite(force_n[number][cell]):
+                on_cell = -force_n[number][cell] * placed.normal[cell]
+                net_n += on_cell
+                torque_nm += np.cross(placed.position_m[cell], on_cell)
+        for found in (placed.wrench(force_n[number]), [each[number] for each in together]):
+            np.testing.assert_allclose(found, [net_n, torque_nm])
+    for wrong in ((3, 2), (1, 3), (3,), (4, 2)):
+        with pytest.raises(ValueError, match="force_n has shape"):
+            placed.wrench(np.ones(wrong))
+
+
+@pytest.mark.parametrize(
+    ("kind", "told", "reason"),
+    [
+        ("sphere", {}, "kind 'sphere' and its fields"),
+        ("flat", {}, "kind 'flat' and its fields"),
+        ("flat", {"pitch_m": np.ones(2), "radius_m": np.ones(())}, "kind 'flat' and its fields"),
+        ("flat", {"pitch_m": np.ones(3)}, r"pitch_m has not the shape \(2,\)"),
+        ("table", dict.fromkeys(KINDS["table"], np.ones((2, 3, 3))), r"not the shape \(4, 4, 3\)"),
+    ],
+)
+def test_a_geometry_that_no_file_may_have_is_refused(
+    kind: str, told: dict[str, Float], reason: str
+) -> None:
+    """A calibration was saved over a good one, and could not be loaded any more."""
+    with pytest.raises(ValueError, match=reason):
+        Geometry(kind, "f", 4, 4, told)
+
+
 def test_without_forces_a_wrench_says_so(tmp_path: Path) -> None:
     """It said that nobody had told where the cells are, though the calibration has it."""
     placed = replace(of_scene("rest"), geometry=geometry(tmp_path / "skin.json", FLAT))
@@ -239,6 +279,7 @@ def test_taxels_of_no_skin_are_refused(tmp_path: Path, lines: str, reason: str) 
     ("text", "reason"),
     [
         ("<robot", "no XML"),
+        ('<robot><array rows="1" cols="1" size="1 1"/><taxel/></robot>', "leave only one kind"),
         ('<!DOCTYPE r [<!ENTITY a "b">]><robot>&a;</robot>', "declares types or entities"),
         ('<robot><taxel xyz="1 2"/></robot>', "is not 3 numbers"),
         ('<robot><taxel rpy="0 inf 0"/></robot>', "is not 3 numbers"),

@@ -102,10 +102,20 @@ def test_no_such_force(wrong: float) -> None:
         skin.step(np.zeros((4, 4)), 0.0)
 
 
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+@pytest.mark.filterwarnings("error")
+def test_a_force_that_its_curve_does_not_reach() -> None:
+    """It was said of the conductances of cells, after a warning."""
+    known = of_scene("rest")
+    model = replace(known.model, kind=np.full((8, 8), "power"), exponent=np.full((8, 8), 0.25))
+    skin = ohmskin.SimulatedSkin(replace(known, model=model))
+    with pytest.raises(ValueError, match=r"force_n of cell \(0, 0\) is more than its curve reach"):
+        skin.step(np.full((8, 8), 1e90), 0.0)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e303, -1e10])
 def test_no_such_time(wrong: float) -> None:
     skin = ohmskin.SimulatedSkin(of_scene("rest"))
-    with pytest.raises(ValueError, match=r"time_s is (nan|inf), not finite"):
+    with pytest.raises(ValueError, match=r"time_s is \S+, a simulation lasts less than 9e\+09 s"):
         skin.step(np.zeros((8, 8)), wrong)
 
 

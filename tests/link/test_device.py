@@ -3,6 +3,7 @@
 pseudo-terminal that is opened like a serial port, and the firmware in the AVR simulator.
 """
 
+import copy
 import gc
 import itertools
 import threading
@@ -17,10 +18,11 @@ import numpy as np
 import pytest
 
 import ohmskin
+from ohmskin import errors
 from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.emulate.urls import emulated
-from ohmskin.errors import CommandRefused, DeviceLost, PortError
+from ohmskin.errors import CommandRefused, DeviceLost, OhmskinError, PortError
 from ohmskin.link import device, framing, protocol
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
@@ -597,3 +599,15 @@ def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch)
         other.join()
     assert early == [False]
     assert written.is_set()
+
+
+def test_every_error_can_go_to_another_process() -> None:
+    """A pool of processes waited for ever: it could not make a refused command anew."""
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
+    kinds = [kind for kind in kinds if issubclass(kind, OhmskinError)]
+    assert CommandRefused in kinds
+    for kind in kinds:
+        told = ("start", "busy", "so") if kind is CommandRefused else ("what", "why")
+        one = kind(*told)
+        again = copy.copy(one)  # as a process makes it anew
+        assert (type(again), str(again), vars(again)) == (kind, str(one), vars(one))

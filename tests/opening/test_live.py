@@ -2,6 +2,7 @@
 """A skin that is always read: what comes, once each, through everything that is unplugged."""
 
 import asyncio
+import os
 import threading
 import time
 from contextlib import suppress
@@ -180,6 +181,28 @@ def test_what_only_shows_a_skin_gets_the_newest_scan(monkeypatch: pytest.MonkeyP
     with LiveSkin(URL, of_scene("ghost")) as skin:
         found = drained(skin, 2)
     assert found[1].number - found[0].number == 1
+
+
+def test_an_error_of_a_watcher_is_logged_and_the_skin_goes_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """It ended the skin, which said that this was a defect of its own."""
+    told = threading.Event()
+    with LiveSkin(os.fsencode(URL), of_scene("ghost")) as skin:
+        skin.watchers |= {lambda: {}["no such key"], told.set}
+        assert len(drained(skin, 5)) == 5
+        assert told.is_set()
+        assert skin.failure is None
+    assert caplog.text.count("a watcher failed, and is not called any more") == 1
+    assert "no such key" in caplog.text
+
+
+def test_a_watcher_may_close_the_skin() -> None:
+    """Closing told the watcher, which closed, and so on."""
+    with LiveSkin(URL, of_scene("ghost")) as skin:
+        skin.watchers.add(skin.close)
+        until(lambda: skin.ended)
+        assert skin.status.endswith("was closed")
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")

@@ -136,6 +136,25 @@ def test_a_part_has_the_tare_that_held_and_the_board_that_was_there(
     assert readings.ref_top_ohm == 10_000
 
 
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        ({"unit_id": 9}, "unit 9 has come in place of unit"),
+        ({"ref_top_ohm": 10_000}, "the board has other reference resistors"),
+    ],
+)
+def test_codes_of_two_boards_are_not_in_one_file(
+    path: Path, hello: Hello, tmp_path: Path, said: dict[str, int], reason: str
+) -> None:
+    """The file had the first board's references for the scans of both."""
+    write_recording(path, hello, [scan(0), replace(hello, **said), scan(1, at_s=1.0)])
+    for name in ("a.npz", "a.csv"):
+        with pytest.raises(RecordingError, match=rf"after 1\.000 s {reason}.*: export each part"):
+            export(path, tmp_path / name)
+    export(path, tmp_path / "b.npz", begin_s=0.5)
+    assert load_readings(tmp_path / "b.npz").ratio.shape[0] == 1
+
+
 def test_cells_that_no_scan_has_read_are_exported_as_such(
     tmp_path: Path, path: Path, hello: Hello
 ) -> None:

@@ -357,6 +357,17 @@ def test_scans_carry_the_tare_in_force(path: Path, hello: Hello) -> None:
         np.testing.assert_array_equal(found, tare.rest_ratio)
 
 
+def test_a_tare_is_not_that_of_a_board_that_comes_later(
+    tmp_path: Path, path: Path, hello: Hello
+) -> None:
+    """Forces of the other skin were wrong by newtons."""
+    tare, other = Tare(np.full((3, 4, 4), 0.25), 0.0), replace(hello, unit_id=hello.unit_id + 1)
+    write_recording(path, hello, [tare, scan(0), hello, scan(1), other, scan(2, at_s=1.0)])
+    assert [each.rest_ratio is None for each in replayed(path)] == [False, False, True]
+    export(path, tmp_path / "a.npz", begin_s=0.5)
+    assert load_readings(tmp_path / "a.npz").rest_ratio is None
+
+
 def test_a_tare_is_the_rest_of_scans_of_its_mode_alone(
     tmp_path: Path, path: Path, hello: Hello
 ) -> None:

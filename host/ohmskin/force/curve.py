@@ -138,7 +138,10 @@ class ForceModel:
         if force.shape != self.kind.shape:
             raise ValueError(f"force_n has shape {force.shape}, this calibration {self.kind.shape}")
         require("force_n", np.isfinite(force) & (force >= 0), "negative or not finite")
-        return np.asarray((force / self.slope) ** (1 / self.exponent))
+        with np.errstate(over="ignore"):
+            rise = np.asarray((force / self.slope) ** (1 / self.exponent))
+        require("force_n", np.isfinite(rise), "more than its curve reaches")
+        return rise
 
 
 @dataclass(frozen=True)

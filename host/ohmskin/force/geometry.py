@@ -79,7 +79,12 @@ class Geometry:
     def __post_init__(self) -> None:
         if not (0 < len(self.frame_id) <= _LONGEST_NAME and self.frame_id.isprintable()):
             raise ValueError(f"frame_id must be a name of 1 to {_LONGEST_NAME} characters")
+        if self.kind not in KINDS or self.told.keys() != {*KINDS[self.kind]}:
+            raise ValueError(f"kind {self.kind!r:.40} and its fields must be of {KINDS}")
+        shapes = {"pitch_m": (2,), "radius_m": ()}
         for name, numbers in self.told.items():
+            if np.shape(numbers) != (shape := shapes.get(name, (self.rows, self.columns, 3))):
+                raise ValueError(f"{name} has not the shape {shape}")
             if not (np.abs(numbers) <= _FARTHEST_M).all():  # so that NaN fails too
                 raise ValueError(f"{name} holds a number beyond {_FARTHEST_M:g}: is it in metres?")
         position_m, normal = self._cells()
@@ -130,11 +135,17 @@ class Geometry:
     def wrench(self, force_n: Float) -> tuple[Float, Float]:
         """Net force -sum F_e n_e [N] and torque -sum p_e x F_e n_e about the frame's origin [N m].
 
-        force_n: (R, C); cells without a force do not count, and where none has one, both are NaN.
+        Both are (..., 3).
+
+        force_n: (..., R, C); cells without a force do not count, and where none has one, both are
+            NaN. Raises ValueError for another shape.
         """
-        known = np.nan_to_num(force_n) if np.isfinite(force_n).any() else force_n
+        if force_n.shape[-2:] != self.normal.shape[:2]:
+            raise ValueError(f"force_n has shape {force_n.shape}, the skin {self.normal.shape[:2]}")
+        lacks = np.isnan(force_n)
+        known = np.where(lacks & ~lacks.all((-2, -1), keepdims=True), 0.0, force_n)
         on_cells = -known[..., None] * self.normal
-        return on_cells.sum((0, 1)), np.cross(self.position_m, on_cells).sum((0, 1))
+        return on_cells.sum((-3, -2)), np.cross(self.position_m, on_cells).sum((-3, -2))
 
     @classmethod
     def of_file(cls, path: PathName, rows: int, columns: int, frame_id: str) -> Self:
@@ -195,6 +206,8 @@ def _of_urdf(text: str, rows: int, columns: int) -> Float:
     if len(of_skins) > 1:
         raise ValueError(f"{len(of_skins)} sensors with taxels: leave only this skin's in the file")
     if grids := tree.findall(".//array"):
+        if tree.findall(".//taxel"):
+            raise ValueError("an <array> and <taxel>s: leave only one kind in the file")
         grid, size = grids[0], (str(rows), str(columns))
         if (of_grid := (grid.get("rows", size[0]), grid.get("cols", size[1]))) != size:
             skin = f"the skin has {rows}x{columns} cells"

@@ -7,7 +7,6 @@ So a policy that is trained in MuJoCo meets ghosts, noise, deviations and contac
 skin has them. It is a simulation: no textile's creep, hysteresis or drift is in it.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
@@ -33,6 +32,8 @@ from ohmskin.link.session import Session
 
 # The skin is tared at first by the mean of so many scans. Chosen: as `ohmskin tare` takes them.
 _TARE_SCANS: Final = 90
+# Times are less than so many seconds: in ns, they have 64 bits.
+_LONGEST_S: Final = 9e9
 
 
 class SimulatedSkin:
@@ -108,8 +109,8 @@ class SimulatedSkin:
         the same. Raises ValueError for forces of another shape, below 0 or not finite, and for such
         a time.
         """
-        if not math.isfinite(time_s):
-            raise ValueError(f"time_s is {time_s:g}, not finite")
+        if not abs(time_s) < _LONGEST_S:
+            raise ValueError(f"time_s is {time_s:g}, a simulation lasts less than {_LONGEST_S:g} s")
         self._force_n = force_n
         codes, mode = self._board.codes_at(time_s), self._settings.mode
         time_us, time_ns = round(1e6 * time_s), round(1e9 * time_s)

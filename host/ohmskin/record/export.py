@@ -34,6 +34,8 @@ FORMATS: Final = (".npz", ".csv")
 _OF_SCAN: Final = {"number": "<i8", "time_us": "<i8", "host_time_s": "<f8", "missed": "<i8"}
 # Type of the readings in a readings file: codes are exact in the 24 bits of single precision.
 _RATIO: Final = np.dtype("<f4")
+# What a code means, by what a board says of itself.
+_means: Final = attrgetter("ref_top_ohm", "ref_bottom_ohm", "adc_bits")
 
 
 class Stacks(ExitStack):
@@ -91,7 +93,8 @@ class Part:
     timed, watch: as `messages` takes them.
 
     :raises ValueError: the part ends before it begins.
-    :raises RecordingError: as `messages`; there are no scans, or they have not all the same size.
+    :raises RecordingError: as `messages`; there are no scans, or they have not all the same size,
+        or are not all of one unit.
     """
 
     path: PathName
@@ -112,14 +115,16 @@ class Part:
             raise ValueError(f"{text}: say --begin below --end")
 
     def __iter__(self) -> Iterator[Scan]:
-        self.scans, size, first_s = 0, None, math.inf
+        self.scans, size, first_s, unit_id = 0, None, math.inf, None
         for of_file in (self.boards, self.tares, self.marks):
             of_file.clear()
         for message in messages(self.path, timed=self.timed, watch=self.watch):
             self.cut_off = message is not None
             match message:
                 case Hello():
-                    board = message
+                    if message.unit_id != unit_id:
+                        self.tares.clear()  # they are of another skin
+                    board, unit_id = message, message.unit_id
                 case Tare():
                     self.tares.append(message)
                 case Mark() if self._holds(message.host_time_s - first_s):
@@ -135,10 +140,20 @@ class Part:
                         raise self.error(f"{change}: export each part by itself")
                     if self.boards[-1:] != [board]:
                         self.boards.append(board)
+                        self._check_same(self.boards[0], board, after_s)
                     self.scans, self.after_s = self.scans + 1, after_s
                     yield message
         if not self.scans:
             raise RecordingError(f"{self.path}: no scans, neither in it nor in this part of it")
+
+    def _check_same(self, first: Hello, board: Hello, after_s: float) -> None:
+        """Raise RecordingError if codes of both boards do not mean the same of one skin."""
+        change = f"unit {board.unit_id} has come in place of unit {first.unit_id}"
+        if board.unit_id == first.unit_id:
+            if _means(board) == _means(first):
+                return
+            change = "the board has other reference resistors or another converter"
+        raise self.error(f"after {after_s:.3f} s {change}: export each part by itself")
 
     def _holds(self, after_s: float) -> bool:
         """Whether this is a moment of the part [s after the first scan]."""

@@ -102,6 +102,8 @@ class Replay(Device):
                         self._publish(replace(message, rest_ratio=rest_ratio, host_time_s=now_s))
                 case Hello():
                     self._check_unit(message)
+                    if message.unit_id != self.info.unit_id:
+                        tares.clear()  # they are of another skin
                     self._hello = message
                 case Tare():
                     tares.append(message)
