@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from network import laplacian_readings
 from ohmskin.circuit.configurations import ratio_from_current
-from ohmskin.circuit.ports import solve_ports
-from ohmskin.circuit.skin import Skin, readings
+from ohmskin.circuit.ports import solve_ports, wires_add_ohm
+from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.estimate.matrix import voltage_squared
 from ohmskin.estimate.methods import LEVEL_METHODS, make_estimator
@@ -92,6 +92,19 @@ def test_port_derivative_agrees_with_finite_differences(rows: int, columns: int,
     # Relative to what one cell does to its own port: rounding of rho, not of the derivative.
     scale = np.abs(np.diagonal(analytic)).max()
     np.testing.assert_allclose(numeric, analytic, rtol=1e-5, atol=1e-6 * scale)
+
+
+@settings(max_examples=30, deadline=None)
+@given(rows=st.integers(1, 5), columns=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
+def test_what_short_wires_add_is_what_the_whole_circuit_says(
+    rows: int, columns: int, seed: int
+) -> None:
+    cell = 1 / random_ohm(np.random.default_rng(seed), (rows, columns))
+    wires = [np.full(cell.shape, ohm) for ohm in (0.1, 0.3)]
+    whole_ohm = port_resistance_ohm(Skin(cell, *wires))
+    ideal_ohm, impedance = solve_ports(cell)
+    added_ohm = wires_add_ohm(impedance, cell, (0.1, 0.3))
+    np.testing.assert_allclose(whole_ohm - ideal_ohm, added_ohm, rtol=1e-2, atol=1e-4)
 
 
 def test_ghost_ohm_reports_the_fourth_corner_and_matrix_does_not() -> None:

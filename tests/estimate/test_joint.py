@@ -9,7 +9,7 @@ import scipy.linalg
 
 from network import SkinCircuit  # tests/helpers
 from ohmskin.arrays import Float
-from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.ports import PortCircuit, solve_ports
 from ohmskin.circuit.skin import Skin, port_resistance_ohm, readings
 from ohmskin.estimate import full_fit
 from ohmskin.estimate.base import Estimate
@@ -504,3 +504,34 @@ def test_a_fingertips_fit_starts_from_its_own_frame_in_a_step_or_two() -> None:
         fit = CellFit(ports, knowledge.ref_ohm, None, START_CHI2 * ports.current.size)
         assert fit.iterations <= 2
         assert not fit.message
+
+
+def test_cells_of_matrix_take_a_step_to_the_most_probable_behind_wires() -> None:
+    """The step is that of least squares with a row for each reading, and for each cell."""
+    trial = finger_trial(3, 4, 1, 5)
+    ports = PortReader(trial.rounded(10).knowledge(0)).read(trial.rounded(10).ratio[0])
+    fit = CellFit(ports, ref_ohm := 60e3, None, 0.0)
+    fit.iterations = 0  # slopes are made at the cells it has found
+    fit._is_linearised = False
+    log_ohm, std = -np.log(fit.best.cell.ravel()), np.linspace(0.01, 0.3, 12)
+    centre, lost_ohm = log_ohm + np.linspace(-0.3, 0.3, 12), np.linspace(0, 3e3, 12).reshape(3, 4)
+
+    def current(logs: Float) -> Float:
+        return 1 / (solve_ports(np.exp(-logs).reshape(3, 4))[0] + ref_ohm).ravel()
+
+    steps = 1e-5 * np.eye(12)
+    slopes = np.array([current(log_ohm + d) - current(log_ohm - d) for d in steps]).T / 2e-5
+    behind = 1 / (1 / current(log_ohm) + lost_ohm.ravel())
+    rows = np.vstack([slopes / ports.current_std.ravel()[:, None], np.diag(1 / std)])
+    left = (ports.current.ravel() - behind) / ports.current_std.ravel()
+    wanted = np.linalg.lstsq(rows, np.concatenate([left, (centre - log_ohm) / std]))[0]
+    found = fit.nearer(centre, std**2, lost_ohm) - log_ohm
+    np.testing.assert_allclose(found, np.clip(wanted, -1.5, 1.5), rtol=1e-3, atol=1e-4)
+
+
+def test_most_fits_of_fingertips_on_large_skins_take_two_steps() -> None:
+    """They took three: where they began, neither wires nor what cells have at rest counted."""
+    frames = finger_trial(16, 16, 30, 7000).rounded(10, wires_told=False)
+    estimator = make_estimator("joint", frames.knowledge(0))
+    steps = [estimator.estimate(ratio).iterations for ratio in frames.ratio]
+    assert np.mean(np.array(steps) <= 2) > 0.6

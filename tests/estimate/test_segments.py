@@ -35,7 +35,7 @@ def late_errors(trial: Trial) -> tuple[Float, Float]:
 
 
 def test_touches_teach_single_segments_of_long_wires(monkeypatch: pytest.MonkeyPatch) -> None:
-    trials = [random_trial(8, 8, 8, 80, seed, wire_ohm=LONG) for seed in range(3)]
+    trials = [random_trial(8, 8, 8, 80, seed, wire_ohm=LONG) for seed in range(6)]
     share, stds_off = np.concatenate([late_errors(trial) for trial in trials], axis=1)
     assert np.mean(stds_off < 4) > 0.98
     monkeypatch.setattr(cells_at_rest, "LEARNED_LINE_OHM", np.inf)

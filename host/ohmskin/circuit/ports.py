@@ -51,6 +51,24 @@ def cells_of_ports(port_siemens: Float) -> Float:
     return np.asarray(port_siemens * port_siemens / (port_siemens + around))
 
 
+def wires_add_ohm(impedance: Float, cell_siemens: Float, wire_ohm: tuple[float, float]) -> Float:
+    """What stripes of so much resistance would add to rho of `solve_ports`, (R, C) [ohm], nearly.
+
+    It is the sum of r i^2 over all segments, i the currents while stripes have no resistance.
+
+    impedance, cell_siemens: Z and the cells of `solve_ports`.
+    wire_ohm: a segment of the top layer, and of the bottom layer.
+    """
+    rows, columns = cell_siemens.shape
+    current = wire_current((impedance[:, :rows, None] - impedance[:, None, rows:]) * cell_siemens)
+    # As many segments lie in one layer as in the other.
+    root = np.sqrt(np.repeat(wire_ohm, rows * columns))
+    current = root * current.reshape(rows + columns, -1)
+    sums = current @ current.T
+    own = sums.diagonal()
+    return np.asarray(own[:rows, None] + own[rows:] - 2 * sums[:rows, rows:])
+
+
 def port_difference(lines: Float, rows: int) -> Float:
     """For each port, the values of its row less those of its column: (RC, n), from (R+C, n)."""
     ports = rows * (len(lines) - rows)

@@ -10,7 +10,7 @@ deviations of the answer say how much of it comes from the prior:
   the frames before have revealed.
 
 The maximum of the posterior is found by a few Gauss-Newton steps (`full_fit`). They begin at the
-few touches that `sparse_fit` finds. If touches are many, as under a fingertip, they begin at the
+few touches that `sparse_fit` finds. If touches are many, as under a fingertip, they begin near the
 cells that `matrix` finds; under a palm, at rest.
 
 `touch` takes the cells at rest and the wires out of the fit and into the noise: its answer is those
@@ -199,8 +199,7 @@ class JointEstimator(Estimator):
     ) -> tuple[Solution, bool]:
         """`_fitted` of all resistances. Damages, and the belief about the wires, learn from it."""
         is_palm = touches is None and self._shows_palm(prior, ports)
-        start = prior.expected if is_palm else self._start(prior, ports, touches)
-        fit, is_tip = self._fit_all(prior, ports, start, is_palm=is_palm)
+        fit, is_tip = self._fit_all(prior, ports, touches, is_palm=is_palm)
         self._touches = prior.touches(fit.log_cells)
         rise_log, message = prior.expected - fit.log_cells, self._doubt(prior, fit)
         if not ports.fault:
@@ -220,14 +219,28 @@ class JointEstimator(Estimator):
         return solution, again
 
     def _fit_all(
-        self, prior: CellPrior, ports: PortReadings, start: Float, *, is_palm: bool
+        self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None, *, is_palm: bool
     ) -> tuple[FullFit, bool]:
-        """The fit of all resistances from `start`, with the prior that suits these touches.
+        """The fit of all resistances, with the prior that suits these touches.
 
         Returns whether it has expected fingertips or a palm, too.
+
+        It starts from the few touches that `SparseFit.find` found, even if `FewTouches.explain`
+        rejected these. Where `find` found none, it starts from cells of `matrix`. `matrix` neglects
+        wires, and what is expected of cells. So one more step goes towards both, by the slopes that
+        `matrix` had. Under a palm, and where far ends show that wires resist too much to be
+        neglected, cells start at rest.
         """
+        ref_ohm, cells = self.knowledge.ref_ohm, None
+        is_long = all(self._belief.far) and self._belief.line_ohm() > LONG_LINE_OHM
+        if touches is not None:
+            start = touches.log_cells
+        elif is_palm or is_long:
+            start = prior.expected
+        else:
+            cells = CellFit(ports, ref_ohm, None, START_CHI2 * ports.current.size)
+            start = _between(-np.log(cells.best.cell.ravel()), prior)
         self._belief.before_fit(start, ports)
-        ref_ohm = self.knowledge.ref_ohm
         if is_palm:
             # On a large skin, cells that conduct less behind shorter wires explain a palm nearly as
             # well. A fit that moves both at once ends there. So cells move first.
@@ -241,6 +254,10 @@ class JointEstimator(Estimator):
             fit_prior = prior.for_fingertips(start, self._shape)
         is_tip = is_palm or fit_prior is not prior
         self._belief.expect_usual(is_tip or prior.is_crowded(start))
+        if cells is not None:
+            expected = fit_prior.about(self._belief.means).normal(start)
+            lost_ohm = self._belief.lost_ohm(cells.best.impedance, cells.best.cell)
+            start = _between(cells.nearer(*expected, lost_ohm), prior)
         return FullFit(fit_prior, self._belief, ref_ohm, ports, start), is_tip
 
     def _shows_palm(self, prior: CellPrior, ports: PortReadings) -> bool:
@@ -295,7 +312,7 @@ class JointEstimator(Estimator):
         at rest. So they stay as they were, but no better known than what this fit makes of them.
         """
         assert self._region is not None
-        fit, _ = self._fit_all(prior, ports, self._start(prior, ports, None), is_palm=False)
+        fit, _ = self._fit_all(prior, ports, None, is_palm=False)
         self._region.keep_others(fit)
         return fit
 
@@ -381,25 +398,11 @@ class JointEstimator(Estimator):
         """Whether weak cells at the edge of a fingertip cannot pass for wires or for a lead."""
         return self.knowledge.are_wires_sure or all(self._belief.far)
 
-    def _start(self, prior: CellPrior, ports: PortReadings, touches: FewTouches | None) -> Float:
-        """Log resistances of the cells to start from, (RC,), if no palm is on the skin.
 
-        They are those of the few touches that `SparseFit.find` found, even if
-        `FewTouches.explain` rejected these. Where `find` found none, they are what `matrix` finds.
-        `matrix` neglects wires, so its cells come out a little too soft. This is wanted: from
-        softer cells, the fit does not fall into the wrong minimum of one hard touch behind long
-        wires. Where far ends show that wires resist too much to be neglected, the cells start at
-        rest.
-        """
-        if touches is not None:
-            return touches.log_cells
-        if all(self._belief.far) and self._belief.line_ohm() > LONG_LINE_OHM:
-            return prior.expected
-        tolerance = START_CHI2 * ports.current.size
-        fit = CellFit(ports, self.knowledge.ref_ohm, None, tolerance)
-        siemens = np.minimum(fit.best.cell.ravel(), HIGHEST_TOUCH_SIEMENS)
-        # No cell starts at more resistance than at rest.
-        return np.minimum(-np.log(siemens), prior.expected)
+def _between(log_cells: Float, prior: CellPrior) -> Float:
+    """These logs, none above rest, nor below that of the hardest touch [log ohm]."""
+    softest = np.maximum(log_cells, -np.log(HIGHEST_TOUCH_SIEMENS))
+    return np.asarray(np.minimum(softest, prior.expected))
 
 
 class TouchEstimator(JointEstimator):

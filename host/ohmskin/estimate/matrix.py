@@ -47,12 +47,13 @@ from scipy.linalg import lapack
 
 from ohmskin.arrays import Float
 from ohmskin.circuit.ports import cells_of_ports, port_difference, solve_ports
-from ohmskin.circuit.small import gram
+from ohmskin.circuit.small import gram, solve_positive
 from ohmskin.estimate.base import Estimator, Solution
 from ohmskin.estimate.knowledge import MAX_CELL_SIEMENS, MIN_CELL_SIEMENS, SkinKnowledge
 from ohmskin.estimate.ohm import conductance_from_current, port_current
 from ohmskin.estimate.port_faults import MOST_CELLS_RATIO
 from ohmskin.estimate.port_readings import PortReadings
+from ohmskin.estimate.prior import MAX_STEP_LOG
 
 # Most steps in a frame: one that does not converge must end, too. Chosen: twice what the hardest
 # frame of the reference takes.
@@ -206,7 +207,7 @@ class CellFit:
         """J, the lower triangle of J^T J, and J^T r at the present cells, unless they are there."""
         if self._is_linearised:
             return
-        self._is_linearised = True
+        self._is_linearised, self._unit = True, self._scale
         current, residual = self.best.current, self.best.residual
         jacobian = voltage_squared(self.best.impedance, len(self.best.cell), self._scale)
         jacobian *= (current**2 / self._current_std)[:, None]
@@ -287,6 +288,26 @@ class CellFit:
             held |= crossing
         stepped = np.clip(cell + step * self._scale, MIN_CELL_SIEMENS, MAX_CELL_SIEMENS)
         return np.asarray(stepped.reshape(self.best.cell.shape), dtype=np.float64)
+
+    def nearer(self, centre: Float, variance: Float, lost_ohm: Float) -> Float:
+        """Logs of the cells' resistances (RC,) [log ohm] after one more step, to the most probable.
+
+        It is one of Gauss-Newton with the last J, without bounds.
+
+        centre, variance: what is expected of these logs, a normal, (RC,).
+        lost_ohm: what wires and leads add to the resistance of each port, (R, C) [ohm].
+        """
+        if not self.iterations:
+            self._linearise()
+        current, cell = self.best.current, self.best.cell.ravel()
+        residual = self._target - current / (1.0 + current * lost_ohm.ravel())
+        log_ohm, logs = -np.log(cell), self._unit / cell  # of a cell's step, as J has it
+        system = self._normal.copy(order="F")
+        np.einsum("ii->i", system)[:] += logs * logs / variance
+        gradient = (residual / self._current_std) @ self._jacobian
+        gradient += logs * (log_ohm - centre) / variance
+        step = logs * solve_positive(system, gradient)
+        return np.asarray(log_ohm - np.clip(step, -MAX_STEP_LOG, MAX_STEP_LOG))
 
     def cell_std(self) -> Float:
         """Root of the diagonal of (J^T J + ridge)^-1 [S], shape (R, C)."""

@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ohmskin.arrays import Float
-from ohmskin.circuit.ports import PortCircuit
+from ohmskin.circuit.ports import PortCircuit, wires_add_ohm
 from ohmskin.circuit.skin import incidence
 from ohmskin.circuit.small import solve_lower
 from ohmskin.estimate.knowledge import LEAST_WIRE_OHM, WireOhm
@@ -369,6 +369,17 @@ class WireBelief(ABC):
     def lead_ohm(self, means: Float) -> Float:
         """The lead of each line by these means (n,), (R+C,) [ohm]."""
         return np.asarray(means[2] * (1.0 + means[self._of_lines]))
+
+    def lost_ohm(self, impedance: Float, cell_siemens: Float) -> Float:
+        """What wires and leads add to the ports of cells (R, C) [S], (R, C) [ohm], nearly.
+
+        impedance: Z of these cells without wires, as of `solve_ports`. A line that is sensed at its
+        far end is taken to add nothing.
+        """
+        top_ohm, bottom_ohm = np.exp(self.means[:2]) * np.logical_not(self.far)
+        leads_ohm = self.leads_of_ports @ self.lead_ohm(self.means)
+        lost = wires_add_ohm(impedance, cell_siemens, (top_ohm, bottom_ohm))
+        return lost + leads_ohm.reshape(self.shape)
 
     def by_means(
         self,
