@@ -247,8 +247,9 @@ def test_ctrl_c_leaves_no_partial_file(
 
     def stuck(*told: object, **more: object) -> object:
         from ohmskin.force import tables  # of the process that writes
+        from ohmskin.record import export
 
-        tables.Stacks.save = lambda *_: time.sleep(600)
+        export.ZipFile = lambda *_: time.sleep(600)
         return tables.export_or_why_not(*told, **more)
 
     def interrupt() -> None:

@@ -23,7 +23,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
@@ -37,7 +37,7 @@ from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
 from ohmskin.force.reader import ForceScan, SkinReader, check_mode
 from ohmskin.link.messages import Scan
 from ohmskin.record.export import FORMATS as OF_READINGS
-from ohmskin.record.export import Part, Stacks, save_readings
+from ohmskin.record.export import Part, save_readings, save_stacked
 from ohmskin.record.recording import tare_of
 
 FORMATS: Final = (*OF_READINGS, ".parquet")
@@ -80,7 +80,7 @@ def load_forces(
     # Each group gives up its share of an array, so that no more than one array is there twice.
     return {
         name: np.concatenate([group.pop(name) for group in groups]) for name in list(groups[0])
-    } | _marks(part)
+    } | next(_marks(part))
 
 
 def export(
@@ -116,10 +116,7 @@ def export(
     elif out.suffix == ".parquet":
         _save_parquet(part, calibration, out, force=force)
     else:
-        with whole_file(out) as file, Stacks(out.parent) as stacks:
-            for arrays in _groups(part, calibration, force=force):
-                stacks.add(arrays)
-            stacks.save(file, _marks(part))
+        save_stacked(out, chain(_groups(part, calibration, force=force), _marks(part)))
     return part
 
 
@@ -196,8 +193,9 @@ def _groups(
         begin += len(group)
 
 
-def _marks(part: Part) -> dict[str, NDArray[Any]]:
-    return {
+def _marks(part: Part) -> Iterator[dict[str, NDArray[Any]]]:
+    """The arrays of the marks: an iterator, because they are known only after the last scan."""
+    yield {
         "mark_text": np.array([mark.text for mark in part.marks], dtype=np.str_),
         "mark_time_ns": np.array([mark.time_ns for mark in part.marks], dtype=np.int64),
     }

@@ -7,15 +7,14 @@ readings file, and empty in the table.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from shutil import copyfileobj
 from tempfile import TemporaryFile
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 from zipfile import ZipFile
 
 import numpy as np
@@ -32,47 +31,40 @@ from ohmskin.record.recording import Mark, Tare, messages, tare_of
 FORMATS: Final = (".npz", ".csv")
 # Attributes of `Scan` that both formats have besides the readings, and their types.
 _OF_SCAN: Final = {"number": "<i8", "time_us": "<i8", "host_time_s": "<f8", "missed": "<i8"}
+# What a readings file has of the board.
+_OF_BOARD: Final = ("ref_top_ohm", "ref_bottom_ohm", "adc_bits")
 # Type of the readings in a readings file: codes are exact in the 24 bits of single precision.
 _RATIO: Final = np.dtype("<f4")
 # What a code means, by what a board says of itself.
 _means: Final = attrgetter("ref_top_ohm", "ref_bottom_ohm", "adc_bits")
 
 
-class Stacks(ExitStack):
-    """Arrays that grow, kept in files without a name in this folder until it is closed."""
+def save_stacked(out: Path, parts: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+    """Write an .npz, as `whole_file`, of arrays that come some rows (n, ...) at a time, by name.
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__()
-        self._new = partial(TemporaryFile, dir=folder)
-        self._files: dict[str, Any] = {}
-        self._first: dict[str, NDArray[Any]] = {}  # rows of each array: they say its form
-
-    def add(self, rows: Mapping[str, NDArray[Any]]) -> None:
-        """Add rows (n, ...) to each of these arrays, by name; always of the same type and shape."""
-        for name, array in rows.items():
-            if name not in self._files:
-                self._first[name] = array
-                self._files[name] = self.enter_context(self._new())
-            self._files[name].write(array.tobytes())
-
-    def save(self, file: BinaryIO, more: Mapping[str, Any]) -> None:
-        """Write all arrays, and the arrays in `more`, as an .npz.
-
-        (`np.savez` takes whole arrays. Even one that is mapped from a file would fill the memory,
-        page by page.)
-        """
+    All rows of an array are of one type and shape; a number comes once. What has come waits in
+    files without a name beside `out`. (`np.savez` takes whole arrays. Even one that is mapped from
+    a file would fill the memory, page by page.)
+    """
+    files: dict[str, Any] = {}
+    first: dict[str, NDArray[Any]] = {}  # rows of each array: they say its form
+    with whole_file(out) as file, ExitStack() as stack:
+        for part in parts:
+            for name, rows in part.items():
+                if name not in files:
+                    first[name] = rows
+                    files[name] = stack.enter_context(TemporaryFile(dir=out.parent))
+                files[name].write(rows.tobytes())
         with ZipFile(file, "w") as archive:
-            for name, rows in self._first.items():
-                shape, kind = rows.shape[1:], rows.dtype
-                whole = self._files[name].tell() // (kind.itemsize * math.prod(shape)), *shape
-                header = {"descr": kind.str, "fortran_order": False, "shape": whole}
+            for name, rows in first.items():
+                of_row = rows.shape[1:]
+                count = files[name].tell() // (rows.itemsize * math.prod(of_row))
+                shape = (count, *of_row) if rows.ndim else ()
+                header = {"descr": rows.dtype.str, "fortran_order": False, "shape": shape}
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     npy.write_array_header_1_0(member, header)
-                    self._files[name].seek(0)
-                    copyfileobj(self._files[name], member)
-            for name, values in more.items():
-                with archive.open(f"{name}.npy", "w") as member:
-                    npy.write_array(member, np.array(values), allow_pickle=False)
+                    files[name].seek(0)
+                    copyfileobj(files[name], member)
 
 
 @dataclass
@@ -170,22 +162,20 @@ def save_readings(part: Part, out: Path) -> None:
     :raises RecordingError: as `Part`, or they are too many for a readings file.
     :raises ValueError: `out` cannot be written.
     """
-    save = _save_csv if out.suffix == ".csv" else _save_npz
     first = next(iter(part))
     size, names = first.codes.shape[:2], {*first.reading_names}
     while True:
         in_order = next((of for of in MODES.values() if {*of} == names), tuple(sorted(names)))
         try:
-            return save(part, out, size, in_order)
+            if out.suffix == ".csv":
+                return _save_csv(part, out, size, in_order)
+            return save_stacked(out, _arrays(part, size, in_order))
         except _MoreNames as more:
-            names |= more.names
+            names |= {*more.args}
 
 
 class _MoreNames(Exception):
-    """A scan has readings of names that the file does not have yet: the file is begun anew."""
-
-    def __init__(self, names: set[str]) -> None:
-        self.names = names
+    """A scan has readings of these names, which the file does not have: it is begun anew."""
 
 
 def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
@@ -196,39 +186,34 @@ def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArr
     if scan.reading_names == names and scan.is_whole:
         return values
     if missing := {*scan.reading_names} - {*names}:
-        raise _MoreNames(missing)
+        raise _MoreNames(*missing)
     widened = np.full((*values.shape[:2], len(names)), np.nan)
     places = [names.index(name) for name in scan.reading_names]
     widened[..., places] = np.where(scan.read[..., None], values, np.nan)
     return widened
 
 
-def _save_npz(part: Part, out: Path, size: tuple[int, ...], names: tuple[str, ...]) -> None:
-    """Write a readings file that also has the arrays of `_OF_SCAN`.
+def _arrays(
+    part: Part, size: tuple[int, ...], names: tuple[str, ...]
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """The arrays of a readings file, with those of `_OF_SCAN`, scan by scan.
 
     Its `rest_ratio` is the last tare before the last scan that is good for it.
     """
     scan_bytes = _RATIO.itemsize * math.prod(size) * len(names)
     most = min(MAX_FRAMES, MAX_ARRAY_BYTES // scan_bytes)
-    with whole_file(out) as file, Stacks(out.parent) as stacks:
-        for scan in part:
-            if part.scans > most:
-                many = f"{part.scans} scans are more than a readings file holds"
-                raise part.error(f"{many}: export a part of them")
-            stacks.add({"ratio": _of_names(scan, scan.ratio, names)[None].astype(_RATIO)})
-            stacks.add({name: np.array([getattr(scan, name)], _OF_SCAN[name]) for name in _OF_SCAN})
-            tare = tare_of(scan, part.tares)  # now: tares that come after the part are read, too
-        board = part.boards[0]
-        more = {
-            "reading_names": names,
-            "ref_top_ohm": float(board.ref_top_ohm),
-            "ref_bottom_ohm": float(board.ref_bottom_ohm),
-            "adc_bits": board.adc_bits,
-        }
-        if tare is not None:
-            at_rest = replace(scan, mode=tare.mode, row_mask=0, column_mask=0)
-            more |= {"rest_ratio": _of_names(at_rest, tare.rest_ratio, names)}
-        stacks.save(file, more)
+    for scan in part:
+        if part.scans > most:
+            many = f"{part.scans} scans are more than a readings file holds"
+            raise part.error(f"{many}: export a part of them")
+        of_scan = {name: np.array([getattr(scan, name)], _OF_SCAN[name]) for name in _OF_SCAN}
+        yield of_scan | {"ratio": _of_names(scan, scan.ratio, names)[None].astype(_RATIO)}
+        tare = tare_of(scan, part.tares)  # now: tares that come after the part are read, too
+    yield {name: np.array(getattr(part.boards[0], name)) for name in _OF_BOARD}
+    yield {"reading_names": np.array(names)}
+    if tare is not None:
+        at_rest = replace(scan, mode=tare.mode, row_mask=0, column_mask=0)
+        yield {"rest_ratio": _of_names(at_rest, tare.rest_ratio, names)}
 
 
 def _save_csv(part: Part, out: Path, size: tuple[int, ...], names: tuple[str, ...]) -> None:
