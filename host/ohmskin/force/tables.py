@@ -179,14 +179,12 @@ def _groups(
     """The arrays of `load_forces`, without the marks, of each so many scans."""
     all_scans, begin = read_forces(part, calibration, force=force), 0
     while group := list(islice(all_scans, scans)):
-        contacts = [contact for scan in group for contact in scan.contacts]
-        counts = [len(scan.contacts) for scan in group]
-        indices = np.arange(begin, begin + len(group), dtype=np.int64)
-        arrays: dict[str, NDArray[Any]] = {"contact_scan": np.repeat(indices, counts)}
+        contacts = [(k, each) for k, scan in enumerate(group, begin) for each in scan.contacts]
+        arrays = {"contact_scan": np.array([k for k, _ in contacts], np.int64)}
         for name, kind in (_OF_SCAN | _OF_CELLS).items():
             arrays[name] = np.array([getattr(scan, name) for scan in group], kind)
         for name, (kind, unknown) in _OF_CONTACT.items():
-            told = [getattr(contact, name) for contact in contacts]
+            told = [getattr(contact, name) for _, contact in contacts]
             known = [unknown if value is None else value for value in told]
             arrays[f"contact_{name}"] = np.array(known, kind).reshape(-1, *np.shape(unknown))
         yield arrays
@@ -204,11 +202,8 @@ def _marks(part: Part) -> Iterator[dict[str, NDArray[Any]]]:
 def _save_csv(scans: Iterator[ForceScan], calibration: Calibration, out: Path) -> None:
     cells = list(np.ndindex(calibration.rows, calibration.columns))
     names = [f"r{row}c{column}_{name}" for name in _OF_CELLS for row, column in cells]
-    of_scan = attrgetter(*_OF_SCAN)
-    rows = (
-        [*of_scan(scan), *scan.force_n.ravel().tolist(), *scan.force_n_std.ravel().tolist()]
-        for scan in scans
-    )
+    of_scan, of_cells = attrgetter(*_OF_SCAN), attrgetter(*_OF_CELLS)
+    rows = ([*of_scan(scan), *np.ravel(of_cells(scan)).tolist()] for scan in scans)
     save_table(out, [*_OF_SCAN, *names], rows)
 
 
