@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ohmskin.arrays import Float
 from ohmskin.emulate.board import BoardSettings, EmulatedBoard
-from ohmskin.emulate.driver import EmulatorLink
+from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.faults import SkinFaults
 from ohmskin.emulate.scenes import BOTTOM_WIRE_OHM, LEAD_OHM, TOP_WIRE_OHM, Scene
 from ohmskin.emulate.urls import DEFAULT_NOISE_LSB
@@ -26,7 +26,7 @@ from ohmskin.estimate.methods import METHODS
 from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
 from ohmskin.force.reader import CalibratedSkin, ForceScan, SkinReader
 from ohmskin.link.codes import ratio_from_codes
-from ohmskin.link.messages import BoardDecoder, Hello, Scan
+from ohmskin.link.messages import Scan
 from ohmskin.link.protocol import ADC_BITS
 from ohmskin.link.session import Session
 
@@ -80,9 +80,8 @@ class SimulatedSkin:
         self._noise_lsb, self._seed = noise_lsb, seed
         self._force_n: ArrayLike = np.zeros((rows, columns))
         self._board = self._pressed(lambda _: self._model.rise(self._force_n))
-        (hello,) = BoardDecoder().feed(self._board.advance(0.0), 0.0)
-        assert isinstance(hello, Hello)
-        self._reader = SkinReader(hello, replace(calibration, nominal_wire_ohm=wires))
+        board = SteppedSkin(SteppedLink(self._board)).info
+        self._reader = SkinReader(board, replace(calibration, nominal_wire_ohm=wires))
         codes = [self._board.codes_at(0.0) for _ in range(_TARE_SCANS)]
         self._reader.tare(ratio_from_codes(np.mean(codes, axis=0), ADC_BITS), force=True)
 
