@@ -208,26 +208,23 @@ def _of_urdf(text: str, rows: int, columns: int) -> Float:
     if grids := tree.findall(".//array"):
         if tree.findall(".//taxel"):
             raise ValueError("an <array> and <taxel>s: leave only one kind in the file")
-        grid, size = grids[0], (str(rows), str(columns))
-        if (of_grid := (grid.get("rows", size[0]), grid.get("cols", size[1]))) != size:
-            skin = f"the skin has {rows}x{columns} cells"
-            raise ValueError(f"an <array> of {'x'.join(of_grid)[:40]} taxels, {skin}")
+        grid, size = grids[0], f"{rows}x{columns}"
+        if (of_grid := f"{grid.get('rows', rows)}x{grid.get('cols', columns)}") != size:
+            raise ValueError(f"an <array> of {of_grid[:40]} taxels, the skin has {size} cells")
         if len(grids) > 1:
             raise ValueError(f"{len(grids)} <array>s: leave only this skin's in the file")
         if (order := grid.get("order", "row-major")) != "row-major":
             raise ValueError(f"order='{order[:40]}' of its <array>: only row-major is read")
         # urdf_tactile has x along rows: its taxel_info_iterator.cpp.
         spacing_m = numbers(grid, "spacing" if grid.get("spacing") else "size", 2, "")
-        at_m = np.argwhere(np.ones((rows, columns))) * spacing_m
-        at_m -= numbers(grid, "offset", 2, "0 0")
-        return np.column_stack([at_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(at_m), 1))])
-    taxels, by_index = [], dict[int, ElementTree.Element]()
+        at_m = np.argwhere(np.ones((rows, columns))) * spacing_m - numbers(grid, "offset", 2, "0 0")
+        return np.array([[*each_m, 0.0, 0.0, 0.0, 1.0] for each_m in at_m])
+    by_index: dict[int, list[float]] = {}
     for place, taxel in enumerate(tree.iter("taxel")):  # without idx, in their order
         if not re.fullmatch(r"\s*\d{1,9}\s*", index := taxel.get("idx", f"{place}")):
             raise ValueError(f"idx='{index[:40]}' is no whole number from 0")
-        if by_index.setdefault(int(index), taxel) is not taxel:
+        if int(index) in by_index:
             raise ValueError(f"two taxels have idx='{int(index)}'")
-    for _, taxel in sorted(by_index.items()):
         turned = Rotation.from_euler("xyz", numbers(taxel, "rpy", 3))
-        taxels.append([*numbers(taxel, "xyz", 3), *turned.apply([0.0, 0.0, 1.0])])
-    return np.array(taxels).reshape(-1, 6)
+        by_index[int(index)] = [*numbers(taxel, "xyz", 3), *turned.apply([0.0, 0.0, 1.0])]
+    return np.array([taxel for _, taxel in sorted(by_index.items())]).reshape(-1, 6)
