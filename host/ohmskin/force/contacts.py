@@ -97,14 +97,12 @@ class ContactTracker:
 def _identities(now: list[Contact], before: list[Contact]) -> dict[int, int]:
     """The identities of those contacts of now that were there before, by their index in `now`."""
     from scipy.optimize import linear_sum_assignment
+    from scipy.spatial.distance import cdist
 
     if not now or not before:
         return {}
-    # Centres as complex numbers, whose differences have the distances as their absolute values.
-    centres, were = (
-        np.array([complex(c.row, c.column) for c in contacts]) for contacts in (now, before)
-    )
-    away = np.abs(centres[:, None] - were)
+    centres = ([(each.row, each.column) for each in contacts] for contacts in (now, before))
+    away = cdist(*centres)
     too_far = away > FARTHEST_CELLS
     # A pair that is too far apart costs more than all others together. So as few of them as
     # possible are made, and these are left out below.
