@@ -36,10 +36,10 @@ from ohmskin.files import RUN, PathName, naming, save_table, whole_file
 from ohmskin.force.calibration import Calibration, CalibrationLike, loaded
 from ohmskin.force.reader import ForceScan, SkinReader, check_mode
 from ohmskin.link.messages import Scan
-from ohmskin.record.export import FORMATS as OF_READINGS
 from ohmskin.record.export import Part, save_readings, save_stacked
 from ohmskin.record.recording import tare_of
 
+OF_READINGS: Final = (".npz", ".csv")
 FORMATS: Final = (*OF_READINGS, ".parquet")
 # What is told of scans and cells, and of which type it is.
 _OF_SCAN: Final = dict.fromkeys(("number", "missed", "time_ns"), "<i8")

@@ -28,7 +28,6 @@ from ohmskin.link.protocol import MODES
 from ohmskin.record.readings import MAX_ARRAY_BYTES, MAX_FRAMES
 from ohmskin.record.recording import Mark, Tare, messages, tare_of
 
-FORMATS: Final = (".npz", ".csv")
 # Attributes of `Scan` that both formats have besides the readings, and their types.
 _OF_SCAN: Final = {"number": "<i8", "time_us": "<i8", "host_time_s": "<f8", "missed": "<i8"}
 # What a readings file has of the board.
@@ -157,7 +156,7 @@ class Part:
 
 
 def save_readings(part: Part, out: Path) -> None:
-    """Write the readings of these scans to `out`, complete or not at all: one of `FORMATS`.
+    """Write the readings of these scans to `out`, .npz or .csv, complete or not at all.
 
     :raises RecordingError: as `Part`, or they are too many for a readings file.
     :raises ValueError: `out` cannot be written.
@@ -178,8 +177,12 @@ class _MoreNames(Exception):
     """A scan has readings of these names, which the file does not have: it is begun anew."""
 
 
-def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
-    """Values (R, C, n) of a scan, in the order of the file's names (R, C, m); NaN where not read.
+def _of_names(
+    scan: Scan, values: NDArray[Any], names: tuple[str, ...], not_read: float | None = np.nan
+) -> NDArray[Any]:
+    """Values (R, C, n) of a scan, in the order of the file's names (R, C, m).
+
+    not_read: stands where nothing was read. None, which is empty in a table, keeps codes whole.
 
     :raises _MoreNames: the scan has readings of other names.
     """
@@ -187,9 +190,9 @@ def _of_names(scan: Scan, values: NDArray[Any], names: tuple[str, ...]) -> NDArr
         return values
     if missing := {*scan.reading_names} - {*names}:
         raise _MoreNames(*missing)
-    widened = np.full((*values.shape[:2], len(names)), np.nan)
-    places = [names.index(name) for name in scan.reading_names]
-    widened[..., places] = np.where(scan.read[..., None], values, np.nan)
+    widened = np.full((*values.shape[:2], len(names)), not_read)
+    widened[..., [names.index(name) for name in scan.reading_names]] = values
+    widened[~scan.read] = not_read
     return widened
 
 
@@ -225,9 +228,6 @@ def _save_csv(part: Part, out: Path, size: tuple[int, ...], names: tuple[str, ..
     times = attrgetter(*_OF_SCAN)
 
     def row(scan: Scan) -> list[Any]:
-        codes = _of_names(scan, scan.codes, names).reshape(-1).tolist()
-        if not (scan.is_whole and scan.reading_names == names):
-            codes = ["" if math.isnan(code) else int(code) for code in codes]
-        return [*times(scan), *codes]
+        return [*times(scan), *_of_names(scan, scan.codes, names, None).ravel().tolist()]
 
     save_table(out, [*_OF_SCAN, *columns], map(row, part))
