@@ -31,6 +31,7 @@ from typing import Any
 from bars import at_most, run_minutes  # beside this file
 from bench_force import board_8x8, calibration  # beside this file
 from ohmskin.emulate.scenes import BEGIN_S, Scene
+from ohmskin.estimate.methods import make_estimator
 from ohmskin.force.reader import SkinReader
 from ohmskin.force.tables import export
 from ohmskin.link.codes import quantise
@@ -77,7 +78,7 @@ def measure(minutes: float) -> dict[str, Any]:
         ratios = [scan.ratio for scan in finger(COMPARED)]
 
         def alone() -> None:
-            estimator = reader._shared.estimator("touch", reader.rest)
+            estimator = make_estimator("touch", reader._knowledge(reader.rest))
             for ratio in ratios:
                 estimator.estimate(ratio)
 

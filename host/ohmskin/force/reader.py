@@ -112,61 +112,6 @@ class Untouched:
     date: str
 
 
-class _SharedKnowledge:
-    """What all readers of one skin know together, whatever way each of them reads its scans.
-
-    A tare that one reader takes must hold for all of them. And `calibration` must have the wires
-    that were learned, whichever reader has learned them and whichever is asked.
-
-    board: the board that scans the skin.
-    calibration: gives newtons; None: there is none.
-    rests: the rest of the calibration, or None where there is no calibration; after it, one rest
-        for each tare that was not undone. The last of them is the rest that holds now.
-    taught: of the estimators that have read scans, the one that knows the wires best.
-    """
-
-    def __init__(self, board: Hello, calibration: Calibration | None, ref_log_std: float) -> None:
-        self.board, self._ref_log_std = board, ref_log_std
-        self.calibration = calibration
-        self.rests: list[Rest | Untouched | None] = [None]
-        self.taught: Estimator | None = None
-        self._recorded: list[Float] = []  # readings of the recorded tares that were taken
-        self._lock = threading.Lock()  # two readers may come to the same one in two threads
-        if calibration is not None:
-            self.rests = [calibration.rest, *filter(None, [calibration.tare])]
-
-    def take_recorded(self, ratio: Float) -> None:
-        """Take the tare that a played scan comes with, unless it was taken before.
-
-        Most scans come with one that was: all scans from one recorded tare to the next have the
-        same array, and several readers may read them. Arrays are compared by identity, because
-        another tare may have equal numbers: undoing a tare records the rest before it once more.
-        """
-        with self._lock:
-            if not any(ratio is recorded for recorded in self._recorded):
-                self._recorded.append(ratio)
-                self.rests.append(Untouched(ratio, now()))
-
-    def hear(self, estimator: Estimator) -> None:
-        """Look whether this estimator, which has read a scan, now knows the wires best."""
-        if estimator is not self.taught and (
-            self.taught is None or _layer_std(estimator) <= _layer_std(self.taught)
-        ):
-            self.taught = estimator
-
-    def estimator(self, method: str, rest: Rest | Untouched | None) -> Estimator:
-        """A new estimator that knows this rest, and the wires that the calibration knows."""
-        return make_estimator(method, self.knowledge(rest))
-
-    def knowledge(self, rest: Rest | Untouched | None) -> SkinKnowledge:
-        """What a method is told of the skin, with this rest."""
-        wires, own = NO_WIRES, None
-        if self.calibration is not None:
-            wires, own = self.calibration.nominal_wire_ohm, self.calibration.own_lead_ohm
-        ratio = None if rest is None else rest.ratio
-        return SkinKnowledge.of(self.board, ratio, wires, self._ref_log_std, own)
-
-
 class SkinReader:
     """Reads scan after scan of one skin: the same scans in the same order give the same forces.
 
@@ -197,14 +142,25 @@ class SkinReader:
         if calibration is not None:
             calibration.check(board, force=force)
         self.board = board
-        self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
-        self._shared = _SharedKnowledge(board, calibration, ref_log_std)
         self.focus: Focus | None = None
+        self._calibration, self._ref_log_std = calibration, ref_log_std
+        self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
+        # All readers of one skin have the same lists and lock, however each reads its scans: a tare
+        # that one takes holds for all, and `calibration` has the wires that any has learned.
+        # The rest of the calibration, or None where there is no calibration; after it, one rest for
+        # each tare that was not undone. The last of them is the rest that holds now.
+        self._rests: list[Rest | Untouched | None] = [None]
+        if calibration is not None:
+            self._rests = [calibration.rest, *filter(None, [calibration.tare])]
+        # Of the estimators that have read scans, the one that knows the wires best, if any has.
+        self._taught: list[Estimator] = []
+        self._recorded: list[Float] = []  # readings of the recorded tares that were taken
+        self._lock = threading.Lock()  # two readers may come to the same one in two threads
         self._begin()
 
     def another(self) -> SkinReader:
         """A reader of the same skin, with the same tares, for another way of reading its scans."""
-        other = copy(self)  # both have the same `_shared`
+        other = copy(self)  # both have the same lists and lock
         other.focus = None  # one reader steers the regions of a board
         other._begin()
         return other
@@ -217,8 +173,7 @@ class SkinReader:
     @property
     def force_method(self) -> str | None:
         """The method that gives newtons: that of the calibration, if there is one."""
-        calibration = self._shared.calibration
-        return None if calibration is None else calibration.method
+        return None if self._calibration is None else self._calibration.method
 
     @property
     def has_forces(self) -> bool:
@@ -228,12 +183,12 @@ class SkinReader:
     @property
     def rest(self) -> Rest | Untouched | None:
         """The rest that holds now; None where it is not known."""
-        return self._shared.rests[-1]
+        return self._rests[-1]
 
     @property
     def is_tared(self) -> bool:
         """Whether there is a tare to undo."""
-        return len(self._shared.rests) > 1
+        return len(self._rests) > 1
 
     @property
     def calibration(self) -> Calibration | None:
@@ -241,16 +196,15 @@ class SkinReader:
 
         `save` keeps them.
         """
-        calibration = self._shared.calibration
+        calibration, rest = self._calibration, self.rest
         if calibration is None:
             return None
-        learned = (self._shared.taught or self._estimator).wires()
+        learned = (*self._taught, self._estimator)[0].wires()
         wires = calibration.nominal_wire_ohm.or_surer(learned)
-        calibration = replace(calibration, nominal_wire_ohm=wires)
-        rest = self.rest
         if isinstance(rest, Untouched):  # a tare of this session has no level yet; a file needs it
-            rest = Rest.of(calibration.method, self._shared.knowledge(rest), rest.date)
-        return replace(calibration, tare=None if rest is calibration.rest else rest)
+            rest = Rest.of(calibration.method, self._knowledge(rest), rest.date)
+        tare = None if rest is calibration.rest else rest
+        return replace(calibration, nominal_wire_ohm=wires, tare=tare)
 
     def warm_up(self) -> None:
         """Estimate a made-up scan of the untouched skin once, with a reader that is not kept.
@@ -271,7 +225,7 @@ class SkinReader:
 
         :raises ValueError: there is none so named, or it takes no regions and `focus` is set.
         """
-        self._shared.estimator(method, self.rest)  # so that an error comes here, not at the scan
+        make_estimator(method, self._knowledge(self.rest))  # so that an error comes here, not later
         if self.focus is not None:
             _check_partial(method)
         self._wanted = method
@@ -285,7 +239,7 @@ class SkinReader:
         """
         # A new estimator judges the readings. The one that reads the scans would begin from the
         # frame before, which may show a touch.
-        estimator = self._shared.estimator(self._wanted, self.rest)
+        estimator = make_estimator(self._wanted, self._knowledge(self.rest))
         estimate = estimator.estimate(rest_ratio)
         if estimate.touched.any() and not force:
             remedy = "take everything off the skin; if nothing is on it: ohmskin tare --force"
@@ -298,7 +252,7 @@ class SkinReader:
                 text = f"most cells conduct less than {_OPEN_SHARE:.0%} of what they did at rest"
                 remedy = "connect the skin; if it is connected: ohmskin tare --force"
                 raise TareRefused(text, remedy)
-        self._shared.rests.append(Untouched(rest_ratio, now()))
+        self._rests.append(Untouched(rest_ratio, now()))
         return self._to_record(rest_ratio)
 
     def tare_by(self, device: Device, seconds: float = TARE_S, *, force: bool = False) -> Tare:
@@ -322,7 +276,7 @@ class SkinReader:
         """
         if not self.is_tared:
             raise TareRefused("there is no tare to undo")
-        self._shared.rests.pop()
+        self._rests.pop()
         return None if self.rest is None else self._to_record(self.rest.ratio)
 
     def _to_record(self, rest_ratio: Float) -> Tare:
@@ -362,7 +316,7 @@ class SkinReader:
             np.array([getattr(estimate, name) for estimate in estimates])
             for name in ("level", "level_std", "touched")
         )
-        geometry, calibration = None, self._shared.calibration if self.has_forces else None
+        geometry, calibration = None, self._calibration if self.has_forces else None
         if calibration is not None:
             levels, stds = calibration.level(estimates)
         rises = np.array([*map(np.subtract, levels, at_rest)])
@@ -394,14 +348,35 @@ class SkinReader:
             sizes = f"{self.board.rows}x{self.board.columns} cells, now {scan.rows}x{scan.columns}"
             raise ValueError(f"the board scanned {sizes}: configure it as before, or open it again")
         if scan.rest_ratio is not None:
-            self._shared.take_recorded(scan.rest_ratio)
+            self._take_recorded(scan.rest_ratio)
         if self._made_for != (method, self.rest):  # rests are compared by identity
             self._make(method)
         estimate = self._estimator.estimate(scan.ratio, scan.reading_names)
-        self._shared.hear(self._estimator)
+        if self._estimator not in self._taught:
+            self._taught[:] = [min([self._estimator, *self._taught], key=_layer_std)]
         # Where rest is unknown, the median cell stands in for it: most cells are untouched.
         at_rest = np.median(estimate.level) if self._rest_level is None else self._rest_level
         return estimate, np.asarray(at_rest)
+
+    def _take_recorded(self, ratio: Float) -> None:
+        """Take the tare that a played scan comes with, unless it was taken before.
+
+        Most scans come with one that was: all scans from one recorded tare to the next have the
+        same array, and several readers may read them. Arrays are compared by identity, because
+        another tare may have equal numbers: undoing a tare records the rest before it once more.
+        """
+        with self._lock:
+            if not any(ratio is recorded for recorded in self._recorded):
+                self._recorded.append(ratio)
+                self._rests.append(Untouched(ratio, now()))
+
+    def _knowledge(self, rest: Rest | Untouched | None) -> SkinKnowledge:
+        """What a method is told of the skin, with this rest, and the wires of the calibration."""
+        wires, own = NO_WIRES, None
+        if self._calibration is not None:
+            wires, own = self._calibration.nominal_wire_ohm, self._calibration.own_lead_ohm
+        ratio = None if rest is None else rest.ratio
+        return SkinKnowledge.of(self.board, ratio, wires, self._ref_log_std, own)
 
     def _begin(self) -> None:
         """Begin with no contact, and as if no scan had come before."""
@@ -411,7 +386,7 @@ class SkinReader:
     def _make(self, method: str) -> None:
         """Make the estimator for the method and the rest that holds now."""
         rest = self.rest
-        self._estimator = self._shared.estimator(method, rest)
+        self._estimator = make_estimator(method, self._knowledge(rest))
         self._rest_level: Float | None = None  # (R, C) [S; 1 for `voltage`]; None: unknown
         if isinstance(rest, Rest) and method == self.force_method:
             self._rest_level = rest.level  # the level above which the curves were learned
