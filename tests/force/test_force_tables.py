@@ -20,6 +20,7 @@ from calibrations import of_scene
 from command_line import Run, assert_one_line, well
 from ohmskin.errors import OhmskinError, RecordingError
 from ohmskin.force import tables
+from ohmskin.force.geometry import Geometry
 from ohmskin.force.reader import ForceScan
 from ohmskin.force.tables import export, load_forces, read_forces
 from ohmskin.record.export import Part
@@ -70,6 +71,15 @@ def test_arrays_are_those_of_a_replay(recorded: Path, played: list[ForceScan]) -
     assert arrays["mark_text"].tolist() == ["here", "end"]
     # A mark is set when a scan arrives, half a period after its middle.
     assert arrays["mark_time_ns"][0] - arrays["time_ns"][12] == pytest.approx(0.5e9 / 90, rel=0.1)
+
+
+def test_contacts_have_places_where_the_calibration_says_where_cells_are(recorded: Path) -> None:
+    flat = Geometry("flat", "skin", 8, 8, {"pitch_m": np.array([0.01, 0.02])})
+    arrays = load_forces(recorded, replace(of_scene("ghost"), geometry=flat))
+    row, column = arrays["contact_row"], arrays["contact_column"]
+    expected = np.stack([0.01 * column, 0.02 * row, 0 * row], axis=-1)
+    np.testing.assert_allclose(arrays["contact_position_m"], expected, atol=1e-12)
+    np.testing.assert_array_equal(arrays["contact_normal"], [[0, 0, 1]] * len(row))
 
 
 def test_a_file_of_arrays_holds_the_same(recorded: Path, tmp_path: Path) -> None:

@@ -44,12 +44,11 @@ FORMATS: Final = (*OF_READINGS, ".parquet")
 # What is told of scans and cells, and of which type it is.
 _OF_SCAN: Final = dict.fromkeys(("number", "missed", "time_ns"), "<i8")
 _OF_CELLS: Final = dict.fromkeys(("force_n", "force_n_std"), "<f4")
-# What is told of contacts, of which type, and what stands there if it is not known.
-_NOWHERE: Final = (np.nan,) * 3
-_OF_CONTACT: Final[dict[str, tuple[str, Any]]] = {
-    "identity": ("<i8", 0),
-    **dict.fromkeys(("row", "column", "force_n", "force_n_std"), ("<f8", np.nan)),
-    **dict.fromkeys(("position_m", "normal"), ("<f8", _NOWHERE)),
+# What is told of contacts, and of which type it is. numpy makes NaN of a place that is None.
+_OF_CONTACT: Final = {
+    "identity": "<i8",
+    **dict.fromkeys(("row", "column", "force_n", "force_n_std"), "<f8"),
+    **dict.fromkeys(("position_m", "normal"), "(3,)<f8"),
 }
 # So many scans are read at once. Chosen: with more, `SkinReader.read_all` takes as long.
 _READ_SCANS: Final = 64
@@ -183,10 +182,9 @@ def _groups(
         arrays = {"contact_scan": np.array([k for k, _ in contacts], np.int64)}
         for name, kind in (_OF_SCAN | _OF_CELLS).items():
             arrays[name] = np.array([getattr(scan, name) for scan in group], kind)
-        for name, (kind, unknown) in _OF_CONTACT.items():
-            told = [getattr(contact, name) for _, contact in contacts]
-            known = [unknown if value is None else value for value in told]
-            arrays[f"contact_{name}"] = np.array(known, kind).reshape(-1, *np.shape(unknown))
+        told = [attrgetter(*_OF_CONTACT)(contact) for _, contact in contacts]
+        rows = np.array(told, [*_OF_CONTACT.items()])
+        arrays |= {f"contact_{name}": rows[name] for name in _OF_CONTACT}
         yield arrays
         begin += len(group)
 
