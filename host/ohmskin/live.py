@@ -109,7 +109,7 @@ class LiveSkin(Closing):
     @property
     def status(self) -> str:
         """That scans come, or why there are none, in words."""
-        said = "gives scans" if self._count else "is being opened"
+        said = "gives scans" if self._count and self._device else "is being opened"
         if self.skipped and not self._count:
             said = "gives scans, all of them too late: end other programs, or ask for a lower rate"
         if self.closing.is_set():
@@ -171,9 +171,7 @@ class LiveSkin(Closing):
         """
         device, reader, failure = self._device, self._reader, self.failure
         if device is None or reader is None:
-            text = "is being opened" if failure is None else f"is not there: {failure}"
-            text = "was closed" if self.closing.is_set() else text
-            raise DeviceLost(f"{self.port} {text}")
+            raise DeviceLost(f"{self.port} is not there: {failure}" if failure else self.status)
         return device, reader
 
     def tare(self, seconds: float = TARE_S, *, force: bool = False) -> "Tare":
