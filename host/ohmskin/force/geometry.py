@@ -123,11 +123,9 @@ class Geometry:
 
     def placed(self, contact: Contact, force_n: Float) -> Contact:
         """The contact with its position, sum F_e p_e / sum F_e, and its normal. force_n: (R, C)."""
-        share = np.where(contact.cells, np.nan_to_num(force_n), 0.0)
-        share = share if share.sum() > 0 else contact.cells.astype(float)
-        share = share / share.sum()
-        position_m = np.tensordot(share, self.position_m, 2)
-        normal = np.tensordot(share, self.normal, 2)
+        weights = force_n[contact.cells] if contact.force_n > 0 else np.ones(contact.cells.sum())
+        position_m = weights @ self.position_m[contact.cells] / weights.sum()
+        normal = weights @ self.normal[contact.cells]
         # Normals of a contact that reaches round a thin finger may cancel.
         normal /= np.linalg.norm(normal) or 1.0
         return replace(contact, position_m=position_m, normal=normal)
