@@ -70,12 +70,10 @@ def open(
     if focus and calibration is None:
         raise ValueError("focus follows contacts, which scans have with a calibration: give one")
     # The file first: a board may take seconds to boot, and a wrong file is known at once.
-    of_skin = None if calibration is None else loaded(calibration)
+    known = None if calibration is None else loaded(calibration)
     with ExitStack() as opened:
         device = opened.enter_context(_device(os.fsdecode(url)))
-        skin = (
-            device if of_skin is None else CalibratedSkin(device, of_skin, force=force, focus=focus)
-        )
+        skin = device if known is None else CalibratedSkin(device, known, force=force, focus=focus)
         if start:
             device.start()
         opened.pop_all()

@@ -57,9 +57,7 @@ class SimulatedSkin:
     ) -> None:
         calibration = loaded(calibration)
         if calibration.method not in METHODS:
-            raise ValueError(
-                "a calibration by 'voltage' knows no conductances: take another method"
-            )
+            raise ValueError("a calibration by 'voltage' has no conductances: take another method")
         rows, columns, wires = calibration.rows, calibration.columns, calibration.nominal_wire_ohm
         if wires.curve_top is not None and calibration.mode != "far":
             # Its cells are those of the curves, and so are the wires up to them.
