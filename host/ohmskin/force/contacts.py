@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contacts: touched cells that adjoin are one thing on the skin, followed from scan to scan."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Final
@@ -136,15 +135,3 @@ def found(touched: Bool, force_n: Float, force_n_std: Float) -> list[list[Contac
     for k, (scan, row, column, of_contact_n, std) in enumerate(zip(*of_contacts, strict=True)):
         contacts[scan].append(Contact(0, row, column, of_contact_n, std, labels[scan] == k + 1))
     return contacts
-
-
-def around(contacts: Iterable[Contact], shape: tuple[int, int]) -> Bool:
-    """The cells (R, C) of these contacts, and one cell around: there a touch is too weak to count
-    as one by itself, and has a force all the same.
-    """
-    from scipy.ndimage import binary_dilation
-
-    touched = np.zeros(shape, dtype=bool)
-    for contact in contacts:
-        touched |= contact.cells
-    return np.asarray(binary_dilation(touched, _EIGHT_NEIGHBOURS[1]))
