@@ -518,11 +518,9 @@ class CalibratedSkin(Closing):
 
     def close(self) -> None:
         """Close the device. May be called again."""
-        try:
+        with self.device:  # which is closed, whatever the focus raises
             if self._focus is not None:
                 self._focus.close()
-        finally:
-            self.device.close()
 
 
 def check_mode(board: Hello, mode: str) -> None:
