@@ -45,25 +45,23 @@ def save_stacked(out: Path, parts: Iterable[Mapping[str, NDArray[Any]]]) -> None
     files without a name beside `out`. (`np.savez` takes whole arrays. Even one that is mapped from
     a file would fill the memory, page by page.)
     """
-    files: dict[str, Any] = {}
-    first: dict[str, NDArray[Any]] = {}  # rows of each array: they say its form
+    files: dict[str, tuple[NDArray[Any], Any]] = {}  # first rows, which say the form, and all rows
     with whole_file(out) as file, ExitStack() as stack:
         for part in parts:
             for name, rows in part.items():
                 if name not in files:
-                    first[name] = rows
-                    files[name] = stack.enter_context(TemporaryFile(dir=out.parent))
-                files[name].write(rows.tobytes())
+                    files[name] = rows, stack.enter_context(TemporaryFile(dir=out.parent))
+                files[name][1].write(rows.tobytes())
         with ZipFile(file, "w") as archive:
-            for name, rows in first.items():
-                of_row = rows.shape[1:]
-                count = files[name].tell() // (rows.itemsize * math.prod(of_row))
-                shape = (count, *of_row) if rows.ndim else ()
-                header = {"descr": rows.dtype.str, "fortran_order": False, "shape": shape}
+            for name, (first, stacked) in files.items():
+                of_row = first.shape[1:]
+                count = stacked.tell() // (first.itemsize * math.prod(of_row))
+                shape = (count, *of_row) if first.ndim else ()
+                header = {"descr": first.dtype.str, "fortran_order": False, "shape": shape}
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     npy.write_array_header_1_0(member, header)
-                    files[name].seek(0)
-                    copyfileobj(files[name], member)
+                    stacked.seek(0)
+                    copyfileobj(stacked, member)
 
 
 @dataclass
