@@ -296,6 +296,32 @@ def test_presses_of_another_unit_are_not_gone_on_with(run: Run, tmp_path: Path) 
     well(run("calibrate", "weights", f"{port}1", str(out), *words))
 
 
+@pytest.mark.parametrize(
+    ("port", "now"),
+    [
+        ("emulator://1x2?mode=far&", "1x2 cells, readings a e b f"),
+        ("emulator://2x2?", "2x2 cells, readings a b c d"),
+    ],
+)
+def test_presses_of_another_size_or_mode_are_not_gone_on_with(
+    run: Run, tmp_path: Path, port: str, now: str
+) -> None:
+    """Readings a b c d were taken for a e b f; and of another size, a press was lost first."""
+    out, ends = str(tmp_path / "skin.json"), "scene=weights&speed=0"
+    words = ("--grams", "50,100,200", "--repeats", "1", *TOLD)
+    well(run("calibrate", "weights", f"emulator://1x2?{ends}", out, *words))
+    done = run("calibrate", "weights", f"{port}{ends}", out, *words)
+    assert_one_line(done, f"presses of 1x2 cells, readings a b c d, the board scans {now}: write")
+
+
+def test_a_weight_that_is_too_light_to_be_seen_is_asked_after(weigh: Run) -> None:
+    """It was waited for without a word."""
+    done = weigh([(40.0, [], 0.0)], *OPTIONS, interrupt_s=20.0)
+    assert done.out.count("nothing is seen there: is the weight too light, or another cell") == 1
+    patient = weigh([(40.0, [], 0.0)], *OPTIONS, interrupt_s=10.0)
+    assert "nothing is seen" not in patient.out
+
+
 def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
     out, port = str(tmp_path / "skin.json"), "emulator://1x2"
     table = tmp_path / "skin.presses.csv"
@@ -313,7 +339,9 @@ def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:
         ),
         ({"--repeats": "0"}, ["--repeats"]),
         ({"--indenter-mm2": "0"}, ["--indenter-mm2 is 0"]),
-        ({"--wires": "-1,2"}, ["top_wire_ohm is -1"]),
+        ({"--wires": "-1,2"}, ["--wires says -1 ohm: from 0 to 100000 are likely"]),
+        ({"--wires": "100,1e6"}, ["--wires says 1e+06 ohm: from 0 to 100000 are likely"]),
+        ({"--leads": "1e9"}, ["--leads says 1e+09 ohm: from 0 to 100000 are likely"]),
         ({"--cells": "0;1"}, ["'0;1' is no cell: write row,column"]),
         ({"--cells": "0,0 1,0"}, ["cell (1, 0) is not on this 1x2 skin"]),
         ({"--cells": "0,0"}, ["too few presses: 3, 5 are needed"]),

@@ -16,9 +16,11 @@ from ohmskin.calibrate.tables import PRESS
 from ohmskin.calibrate.wires import FoundWires, PressReadings, find_wires
 from ohmskin.circuit.configurations import current_from_ratio
 from ohmskin.circuit.skin import Skin
+from ohmskin.cli.calibrate import _wires_in_words
 from ohmskin.estimate.knowledge import SkinKnowledge, WireOhm
 from ohmskin.force.calibration import load_calibration
 from pressed_skin import LAWS, Plan, PressedSkin, calibrate
+from stepped import stepped
 
 FORCES_N = np.geomspace(0.5, 8.0, 6)
 REF_OHM = 30_000.0
@@ -323,7 +325,12 @@ def test_recordings_tell_the_wires(law: str, wires: tuple[float, float], tmp_pat
     words = f"wires: {found.top:.0f} and {found.bottom:.0f} ohm a segment by 80 presses, "
     assert words in said
     assert "told" not in said
-    # Other wires are told: it says so, and finds the same.
+    # Other wires are told: it says so, and finds the same. So it does where far ends show them.
+    of_far = replace(load_calibration(out), mode="far")
+    board = replace(stepped("emulator://4x4").info, mode="near")
+    calibrator = Calibrator(board, of_far.rest.ratio, "ohm", None, WireOhm(1e3, 9e3), force=True)
+    assert "by far ends" in (by_far := _wires_in_words(of_far, calibrator))
+    assert "; told: 1000, 9000: they disagree" in by_far
     told = wires[0] / 2, wires[1] / 2
     said = calibrate(recording, out, "ohm", WireOhm(*told))
     assert f"; told: {told[0]:g}, {told[1]:g}: they disagree" in said

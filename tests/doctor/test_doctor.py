@@ -51,7 +51,11 @@ def test_a_sound_skin_has_no_finding(rows: int, columns: int) -> None:
         assert diagnosis.findings == [], url
         assert diagnosis.wires_hidden
         assert measured_in_words(diagnosis)["wires"].startswith("not known: an untouched skin")
-        assert verdict(diagnosis).startswith("sound: nothing is wrong that an untouched skin shows")
+        said = verdict(diagnosis)
+        assert said.startswith("sound: nothing is wrong that an untouched skin shows")
+        # Nothing in two lines says which of them is as it should be; and no line has a rectangle.
+        assert ("hardly show shorts" in said) == (2 in (rows, columns))
+        assert said.endswith("; --press shows its wires") == (1 not in (rows, columns))
         assert diagnosis.measured["reference_ratio"] == pytest.approx(1, abs=0.03)
         assert diagnosis.measured["noise_lsb"] < 0.8
 

@@ -48,6 +48,15 @@ def verified(run: Run, url: str, plate: str, *more: str) -> tuple[int, dict]:
     return done.code, json.loads(done.out)
 
 
+@pytest.mark.usefixtures("benches")
+def test_errors_are_in_columns_and_an_open_joint_has_none(run: Run, write: Write) -> None:
+    """Its error of 579531 % touched the next number."""
+    url = f"emulator://8x8?plate={write(other(PLATE, **{'0,1': None}), 'there')}"
+    done = run("verify", url, write(PLATE), "--seconds", "1")
+    first = done.out.split("row by row:\n")[1].splitlines()[0]
+    assert first.split() == [".", "open", *6 * "."]
+
+
 @pytest.mark.parametrize("noise", [0, 0.3, 0.5])
 @pytest.mark.parametrize("ohm", [PLATE, CHAIN])
 @pytest.mark.usefixtures("benches")

@@ -167,6 +167,16 @@ def test_a_cell_that_opened_is_named_though_its_current_hardly_fell(method: str)
     assert found.message == "cell (1, 2): conducts less than at rest, is a line open?"
 
 
+def test_a_fault_that_both_ports_and_fit_show_is_named_once() -> None:
+    rest = skin_at_rest(3, 4, np.random.default_rng(1))
+    cells = rest.cell_siemens.copy()
+    cells[1, 1] = 1e-9
+    known, measured = told(readings(rest)), ten_bits(readings(replace(rest, cell_siemens=cells)))
+    found = make_estimator("joint", known).estimate(measured)
+    assert PortReader(known).read(measured).fault == found.message
+    assert found.message == "cell (1, 1): conducts less than at rest, is a line open?"
+
+
 @pytest.mark.parametrize("touches", [0, 12])
 def test_a_cell_of_16x16_that_opened_is_named_in_every_frame(touches: int) -> None:
     """The log of its resistance is hardly known: it may be anything large."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from ohmskin.link import device, framing, protocol
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
 from ports import Serve
+from recordings import write_recording
 from stepped import stepped, stepped_link
 from waiting import until
 
@@ -414,6 +416,20 @@ def test_a_mean_of_no_time_is_refused(seconds: float) -> None:
         pytest.raises(ValueError, match=rf"no mean of {seconds:g} seconds: say 0 or more"),
     ):
         skin.mean_ratio(seconds)
+
+
+def test_a_mean_is_not_of_less_time_than_was_asked_for(tmp_path: Path) -> None:
+    """A recording that was shorter gave that of all of it, its touches among them."""
+    path, board = tmp_path / "a.mcap", stepped("emulator://1x1?rate=10")
+    write_recording(path, board.info, [*itertools.islice(board, 11)])
+    for seconds in (0.0, 0.5, 1.0):
+        with ohmskin.open(f"replay://{path}?speed=0") as skin:
+            assert skin.mean_ratio(seconds).shape == (1, 1, 4)
+    with (
+        ohmskin.open(f"replay://{path}?speed=0") as skin,
+        pytest.raises(ValueError, match=r"no mean of 2 seconds: replay.* ends before"),
+    ):
+        skin.mean_ratio(2.0)
 
 
 def test_latest_waits_as_long_as_told() -> None:

@@ -50,6 +50,9 @@ _FIRMWARE: Final = Path(__file__).parents[1] / "firmware"  # there is none but i
 # may be in its boot loader.
 _RETRY_S: Final = 0.2
 
+# More ohms a segment, or a lead, are no yarn's: somebody has told another unit. Chosen.
+MOST_TOLD_OHM: Final = 1e5
+
 # Where commands print what people read. No line is broken, so that a pipe gets messages whole.
 TERMINAL: Final = Terminal(soft_wrap=True)
 
@@ -84,7 +87,10 @@ def wires_of(text: str, lead_ohm: float | None) -> WireOhm:
         top, bottom = map(float, text.split(",")) if text else (None, None)
     except ValueError:
         raise ValueError(f"--wires wants two numbers, as 100,200, not '{text}'") from None
-    return WireOhm(top, bottom, lead_ohm).check()
+    for option, ohm in (("--wires", top), ("--wires", bottom), ("--leads", lead_ohm)):
+        if ohm is not None and not 0 <= ohm <= MOST_TOLD_OHM:
+            raise ValueError(f"{option} says {ohm:g} ohm: from 0 to {MOST_TOLD_OHM:g} are likely")
+    return WireOhm(top, bottom, lead_ohm)
 
 
 def line_name(line: int, rows: int) -> str:

@@ -24,7 +24,7 @@ from ohmskin.calibrate.rules import check_cells_differ, check_enough
 from ohmskin.calibrate.scale import printed_s, wrong_numbers
 from ohmskin.calibrate.sessions import beside, check_same, joined, session_paths
 from ohmskin.calibrate.tables import ForceLog, load_force_log, load_press_table
-from ohmskin.calibrate.wires import UNCLEAR_LOG
+from ohmskin.calibrate.wires import UNCLEAR_LOG, FoundWires
 from ohmskin.cli.board import (
     TERMINAL,
     Leads,
@@ -128,7 +128,7 @@ def weights(
     kept = KeptPresses(beside(out, ".presses.csv"))
     with ohmskin.open(port) as skin:
         skin.only_unit = skin.info.unit_id  # no other may come while nobody looks
-        kept.go_on(skin.info.unit_id)
+        kept.go_on(skin.info)
         shape = skin.info.rows, skin.info.columns
         only, again = cells_of(cells, shape), cells_of(" ".join(redo or ()), shape)
         on_each_n = forces_n * (repeats or 1)
@@ -535,8 +535,10 @@ def _conclude(calibration: Calibration, calibrator: Calibrator, out: Path) -> No
 
 def _wires_in_words(calibration: Calibration, calibrator: Calibrator) -> str:
     """What the calibration keeps of the wires, and what has shown them."""
-    wires, found = calibration.nominal_wire_ohm, calibrator.found
-    lead_ohm = wires.lead if found is None else found.told.lead
+    wires, asked = calibration.nominal_wire_ohm, calibrator.nominal_wire_ohm
+    # Far ends show the wires without presses.
+    found = calibrator.found or FoundWires(wires, asked, 0, ())
+    lead_ohm = found.told.lead
     leads = "" if lead_ohm is None else f"; leads of {lead_ohm:g} ohm, as told"
     if wires.both is None:
         by = "" if calibration.mode == "far" else " --press --wires 100,200"
@@ -549,17 +551,15 @@ def _wires_in_words(calibration: Calibration, calibrator: Calibrator) -> str:
     if wires.top_log_std is None or wires.bottom_log_std is None:
         return f"{line}, as told{leads}"
     percent = [f"{100 * std:.0f} %" for std in (wires.top_log_std, wires.bottom_log_std)]
-    source = "far ends" if found is None else f"{found.presses} presses"
+    source = f"{found.presses} presses" if found.presses else "far ends"
     line += f" by {source}, {' and '.join(dict.fromkeys(percent))}"
-    if found is None:
-        return line
     if found.told.both is not None:
         words = "they disagree" if found.disagrees else "they agree"
         line += f"; told: {found.told.top:g}, {found.told.bottom:g}: {words}"
     ohm, std_ohm = wires.lead or 0.0, wires.lead_std_ohm or 0.0
     if found.lead_disagrees:
         leads = f"; leads of {ohm:.0f} ohm; told: {lead_ohm:g}: they disagree"
-    elif lead_ohm is None and std_ohm < UNCLEAR_LOG * ohm:
+    elif calibrator.found and lead_ohm is None and std_ohm < UNCLEAR_LOG * ohm:
         leads = f"; leads of {ohm:.0f} ohm, {100 * std_ohm / ohm:.0f} %"
     line += leads
     if found.unclear:

@@ -116,9 +116,13 @@ def verdict(diagnosis: Diagnosis) -> str:
         return "no fault found, but nobody pressed three corners of a rectangle: run this again"
     if diagnosis.pressed and diagnosis.wires_hidden:
         return "no fault found, but these presses do not show the wires: see 'wires'"
+    pairs = [f"two {name}" for name in ("rows", "columns") if diagnosis.measured.get(name) == 2]
+    hidden = f" ({' and '.join(pairs)} hardly show shorts and exchanged ends)" if pairs else ""
     if diagnosis.wires_hidden:
-        return "sound: nothing is wrong that an untouched skin shows; --press shows its wires"
-    return "sound: nothing is wrong"
+        is_line = 1 in (diagnosis.measured.get("rows"), diagnosis.measured.get("columns"))
+        press = "" if is_line else "; --press shows its wires"
+        return f"sound: nothing is wrong that an untouched skin shows{hidden}{press}"
+    return f"sound: nothing is wrong{hidden}"
 
 
 def measured_in_words(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST: Final = Tolerance()
+# Where a resistor is off by as much [%], there is none.
+OPEN_PERCENT: Final = 99.5
 _out = Terminal(soft_wrap=True, highlight=False)
 
 
@@ -100,7 +102,12 @@ def _print_exam(exam: PlateExam) -> None:
         _out.print(f"{clock:<18}  noise {noise_lsb:.2f} LSB")
     _out.print("\nerror of each resistor in percent, row by row:")
     for row in exam.error_percent:
-        _out.print("".join("      ." if np.isnan(each) else f"{each:7.2f}" for each in row))
+        _out.print("".join(f"{_percent(each):>8}" for each in row))
+
+
+def _percent(error: float) -> str:
+    """An error of a resistor [%], in words."""
+    return "." if np.isnan(error) else f"{error:.2f}" if abs(error) < OPEN_PERCENT else "open"
 
 
 def _draw(figure: "Figure", exam: PlateExam) -> None:
@@ -119,7 +126,9 @@ def _draw(figure: "Figure", exam: PlateExam) -> None:
         axes.set(xticks=crossings[: values.shape[1]], yticks=crossings[: values.shape[0]])
         for (row, column), value in np.ndenumerate(values):
             colour = "white" if abs(value) > 1.4 * limit else "black"
-            text = "" if np.isnan(value) else f"{value:.1f}" if abs(value) < 99.5 else "open"
+            text = (
+                "" if np.isnan(value) else f"{value:.1f}" if abs(value) < OPEN_PERCENT else "open"
+            )
             if axes is of_cells and exam.wrong[row, column]:
                 text = f"[{text or 'bridge'}]"
             axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=size)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Leads a person who puts known weights on a skin, on cell after cell or anywhere."""
 
+import math
 from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,7 +18,8 @@ from ohmskin.calibrate.tables import PRESS, PressTable, load_press_table, save_p
 from ohmskin.cli.board import TERMINAL
 from ohmskin.ctrl_c import until_ctrl_c
 from ohmskin.link.device import Device, mean_ratio
-from ohmskin.link.messages import Scan
+from ohmskin.link.messages import Hello, Scan
+from ohmskin.link.protocol import MODES
 from ohmskin.record.force_sensor import NEWTONS
 from ohmskin.record.readings import load_arrays, load_readings, save_arrays
 from ohmskin.record.recorder import Recorder
@@ -27,6 +29,8 @@ from ohmskin.record.recording import ForceSample, Mark, Recording
 WEIGHTS: Final = "weights"
 # The cell of a press that may be anywhere: the skin is taken for one cell.
 ANYWHERE: Final = (0, 0)
+# Where a weight is awaited for so long [s], it may lie there, too light to be seen. Chosen.
+UNSEEN_S: Final = 15.0
 # By these columns of the table, the readings of a press are found.
 _KEYS: Final = ("row", "column", "conductance")
 # Conductances are the same if they differ by less than this share. Chosen: a spreadsheet program
@@ -44,6 +48,7 @@ class KeptPresses:
 
     ratios: mean readings under each press, (n, R, C, 4); None: they are not known of all, as of a
         table that somebody else has made.
+    reading_names: which readings they are.
     unit_id: of the board whose presses these are, kept beside the readings; None: it is not known.
     """
 
@@ -51,22 +56,31 @@ class KeptPresses:
         self.path, self._readings_path = path, path.with_suffix(".npz")
         self.table: PressTable = load_press_table(path) if path.exists() else np.empty(0, PRESS)
         self.ratios: Float | None = None
+        self.reading_names = MODES["near"]
         self.unit_id: float | None = None
         if self._readings_path.exists() and self.table.size:
-            ratios = load_readings(self._readings_path).ratio
+            readings = load_readings(self._readings_path)
+            ratios, self.reading_names = readings.ratio, readings.reading_names
             of_rows = _rows_of(self.table, load_arrays(self._readings_path, _KEYS), len(ratios))
             self.ratios = None if of_rows is None else ratios[of_rows]
             if units := load_arrays(self._readings_path, ("unit_id",)):
                 self.unit_id = units["unit_id"].item()
 
-    def go_on(self, unit_id: int) -> None:
+    def go_on(self, board: Hello) -> None:
         """Go on with presses of this board. Raises ValueError if those of before are another's."""
-        if self.unit_id not in (None, unit_id):
-            raise ValueError(
-                f"{self.path}: presses of unit {self.unit_id:.0f}, the board is unit {unit_id}: "
-                "write another calibration file, or move this table away"
-            )
-        self.unit_id = unit_id
+        now, kept = f"the board is unit {board.unit_id}", None
+        names = MODES[board.mode]
+        if self.unit_id not in (None, board.unit_id):
+            kept = f"unit {self.unit_id:.0f}"
+        elif self.ratios is not None:
+            skin = f"{board.rows}x{board.columns} cells, readings {' '.join(names)}"
+            rows, columns = self.ratios.shape[1:3]
+            before = f"{rows}x{columns} cells, readings {' '.join(self.reading_names)}"
+            now, kept = f"the board scans {skin}", None if before == skin else before
+        if kept:
+            remedy = "write another calibration file, or move this table away"
+            raise ValueError(f"{self.path}: presses of {kept}, {now}: {remedy}")
+        self.unit_id, self.reading_names = board.unit_id, names
 
     @property
     def presses(self) -> list[Press]:
@@ -114,8 +128,10 @@ class KeptPresses:
             self._readings_path.unlink(missing_ok=True)  # they are of some presses only
         else:
             keys = {name: self.table[name] for name in _KEYS}
-            unit = {} if self.unit_id is None else {"unit_id": np.array(self.unit_id)}
-            save_arrays(self._readings_path, {"ratio": self.ratios} | keys | unit)
+            more = {"ratio": self.ratios, "reading_names": np.array(self.reading_names)}
+            if self.unit_id is not None:
+                more["unit_id"] = np.array(self.unit_id)
+            save_arrays(self._readings_path, more | keys)
         save_press_table(self.path, self.table)
 
 
@@ -178,7 +194,7 @@ def guided(
     anywhere = isinstance(kept, KeptAnywhere)
     places = np.random.default_rng(0).uniform(0, np.array(rest.shape) - 1, (total + 1, 2)).tolist()
     window: deque[Scan] = deque()  # the scans that a press is read from
-    done, last_line = total - len(missing), ""
+    done, last_line, since_us = total - len(missing), "", math.inf
     columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
     bar = Progress(*columns, console=TERMINAL, transient=True, disable=not TERMINAL.is_terminal)
     task = bar.add_task("", total=total)
@@ -204,7 +220,11 @@ def guided(
                 kept.add(step, rest, window)
                 done += 1
                 TERMINAL.bell()
+            if step.state is not State.PUT or scan.time_us < since_us:
+                since_us = scan.time_us
             line, now = _step_in_words(step, anywhere)
+            if step.state is State.PUT and scan.time_us - since_us > 1e6 * UNSEEN_S:
+                line = "nothing is seen there: is the weight too light, or another cell meant?"
             if line and line != last_line:
                 counted = f"{done} of {total}: " if step.rise is not None else ""
                 TERMINAL.print(counted + line, highlight=False)

@@ -237,7 +237,7 @@ class Estimator(ABC):
         with one_blas_thread:
             ports = self._reader.read(readings, in_order=True)
             solution = self._solve(ports)
-        message = "; ".join(filter(None, (ports.fault, solution.message)))
+        message = "; ".join(filter(None, dict.fromkeys((ports.fault, solution.message))))
         touched = self._touched(solution)
         level, level_std = self._level(readings, solution)
         wires, wires_std = (

@@ -215,9 +215,8 @@ class Calibration:
             remedy = f"calibrate this skin, or {told} if it is that one"
             raise ValueError(f"this calibration is of a {sizes}: {remedy}")
         if board.mode != self.mode and not is_near((*MODES[board.mode], *MODES[self.mode])):
-            remedy = (
-                f"'ohmskin configure PORT --mode {self.mode} --save', or calibrate this skin anew"
-            )
+            told = f"'ohmskin configure PORT --mode {self.mode} --save'"
+            remedy = f"take a calibration in mode {board.mode}, or scan by {told}"
             raise ValueError(f"this calibration is of mode {self.mode}, not {board.mode}: {remedy}")
         if board.unit_id != self.unit_id and not force:
             units = f"unit {self.unit_id}, the board is unit {board.unit_id}"

@@ -40,6 +40,9 @@ QUEUE_SCANS: Final = 1024
 # A command is sent so often before the board counts as lost. Chosen: where a line damages one frame
 # in a hundred, one command in fifty, or its answer, is lost, and three in a row are 8 in a million.
 COMMAND_TRIES: Final = 3
+# A mean is of this share of the time that was asked for, at least. Chosen: a recording of a second
+# has scans of a little less.
+_LEAST_SHARE: Final = 0.9
 _S = TypeVar("_S", bound=Scan)
 
 
@@ -228,11 +231,15 @@ class Device(Closing):
         """`mean_ratio` of the scans of the coming seconds.
 
         :raises DeviceLost: the board went away, or there are no more whole scans.
-        :raises ValueError: seconds are below 0, infinite or no number.
+        :raises ValueError: seconds are below 0, infinite or no number; or a recording ends before.
         """
         if not 0 <= seconds < float("inf"):
             raise ValueError(f"no mean of {seconds:g} seconds: say 0 or more, 0 for one scan")
-        return mean_ratio(scans_for(self, seconds))
+        scans = [*scans_for(self, seconds)]
+        passed_s = 1e-6 * np.diff([scan.time_us for scan in scans]).clip(0).sum()
+        if scans and passed_s < _LEAST_SHARE * seconds:
+            raise ValueError(f"no mean of {seconds:g} seconds: {self.name} ends before")
+        return mean_ratio(scans)
 
     def start(self) -> None:
         """Start scanning. Does nothing when the device scans already.
