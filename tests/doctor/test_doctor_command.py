@@ -208,7 +208,7 @@ def test_a_wrong_use_is_one_line(run: Run, tmp_path: Path) -> None:
     assert_one_line(run("doctor", "emulator://8x8?colour=1"), "no option 'colour'")
     assert_one_line(run("doctor", "emulator://8x8", "--wires", "100"), "two numbers")
     assert_one_line(run("doctor", "emulator://8x8", "--wires", "100,-1"), "-1", "from 0 to")
-    assert_one_line(run("doctor", "emulator://8x8", "--leads", "-1"), "nominal_lead_ohm is -1")
+    assert_one_line(run("doctor", "emulator://8x8", "--leads", "-1"), "--leads says -1 ohm")
     assert_one_line(run("doctor", "emulator://8x8", "--calibration", "/no/such.json"), "/no/such")
     assert_one_line(run("doctor", "emulator://1x4", "--press"), "1x4", "no rectangle")
     far = run("doctor", "emulator://8x8?mode=far", "--press")

@@ -122,7 +122,7 @@ def test_nominal_wires_are_no_finding(size: str) -> None:
         said = measured_in_words(diagnosis)
         assert "times nominal" in said["wires"]
         assert len(said["wires_of_lines"]) == 2
-        assert verdict(diagnosis) == "sound: nothing is wrong"
+        assert verdict(diagnosis).startswith("sound: nothing is wrong")
 
 
 def test_a_lead_that_a_calibration_knows_is_no_finding() -> None:

@@ -72,6 +72,8 @@ def _words(kind: Kind, lines: tuple[int, ...], values: Mapping[str, Any]) -> dic
             return {"dropped": missed and values["dropped_by_board"], "few": not missed}
         case Kind.HUM:
             return {"mains": " or ".join(f"{hz:.0f} Hz" for hz in values["mains_hz"])}
+        case Kind.LINE_WIRE:
+            return {"negative": values["ohm"] < 0}
         case Kind.WIRES:
             top, bottom = nominal_ohm = values["nominal_ohm"]
             return {"told": _ohm(values["share"], nominal_ohm), "top": top, "bottom": bottom}
