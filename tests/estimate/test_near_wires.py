@@ -82,7 +82,7 @@ def test_limits_of_untold_wires_count_as_more_deviations_until_frames_teach_them
     belief, taught = LearnedWires((2, 2), WireOhm()), []
     unknown = belief.upper_limits()
     np.testing.assert_allclose(unknown.reach[:2], np.expm1(2 * UNKNOWN_LAYER_STD))
-    np.testing.assert_allclose(unknown.stds, unknown.reach / [5, 5, 2])
+    np.testing.assert_allclose(unknown.stds, unknown.reach / [4.5, 4.5, 2])
     means = np.add(belief.means, [2.5, 0, 0, 0, 0, 0, 0])  # a layer of 1.8 kOhm
     for log_std in (0.45, 0.31, 0.29):
         belief._believe(means, np.diag([log_std, log_std, 200.0, 0.1, 0.1, 0.1, 0.1]) ** 2)

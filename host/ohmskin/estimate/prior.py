@@ -95,9 +95,9 @@ MAX_STEP_LOG: Final = 1.5
 REACH_STDS: Final = 2.0
 # Where nobody has told the wires and no frame has taught them, their upper limits count as so many
 # deviations away. Chosen: few skins have wires near these limits. With 4, deviations under
-# fingertips would be a sixth wider, and with 5 99.9 % of the cells behind wires of 20 ohm to 1 kohm
-# are within four of them (`make bench-fingers`).
-UNTOLD_REACH_STDS: Final = 5.0
+# fingertips would be an eighth wider, and with 5, wires of 1 kohm would hide more of what they do
+# (docs/estimate.md, "What the standard deviation covers").
+UNTOLD_REACH_STDS: Final = 4.5
 # Where wires are longer than the fit has them, they take at most this share of a cell's resistance.
 # Chosen: all of it, and what slopes err by.
 MOST_LOST_SHARE: Final = 1.05
