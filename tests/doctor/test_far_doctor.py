@@ -398,3 +398,25 @@ def test_a_wire_below_0_ohm_is_said_to_leak() -> None:
     found = [one for one in diagnosis.findings if one.kind is Kind.LINE_WIRE]
     assert found
     assert all("as a damp one does" in words_of(one)["what_to_do"] for one in found)
+
+
+@pytest.mark.parametrize(
+    ("size", "axis", "lines"), [("4x3", 0, (1, 2)), ("3x4", 1, (1, 2)), ("3x3", 0, (0, 2))]
+)
+def test_exchanged_far_ends_of_a_small_skin_are_named(
+    size: str, axis: int, lines: tuple[int, int]
+) -> None:
+    """Half of the lines gave all of them a lead of 270 kOhm, and all far ends seemed open."""
+    pair = ",".join(map(str, lines))
+    option = f"swap_far_{('rows', 'columns')[axis]}={pair}"
+    for seed in range(4):
+        found = examine(evidence(f"emulator://{size}?mode=far&seed={seed}&{option}")).findings
+        places = [(one.kind, one.place.rows, one.place.columns) for one in found]
+        assert places == [(Kind.SWAPPED_FAR, *((lines, ()) if axis == 0 else ((), lines)))]
+
+
+def test_exchanged_far_ends_of_two_rows_are_not_called_sound() -> None:
+    """Nothing in two rows says which of them is as it should be."""
+    for seed in range(4):
+        skin = f"emulator://2x8?mode=far&seed={seed}&swap_far_rows=0,1"
+        assert examine(evidence(skin)).worse

@@ -257,10 +257,12 @@ class _Layer:
         np.einsum("lkk->lk", covariance)[:] += self.std_ohm**2
         columns = np.concatenate([slopes, self.loss_ohm[..., None]], axis=2)
         products = columns.swapaxes(1, 2) @ np.linalg.solve(covariance, columns)
-        # Both unknowns of each line; a line of one crossing does not tell them apart.
+        # Both unknowns of each line; a line of one crossing does not tell them apart. No wire loses
+        # as much as a far end that shows another line, and few lines would have a median of both.
         by_lead, both, by_mean = products[:, 0, 0], products[:, 0, 1], products[:, 1, 1]
         precision = by_lead - both**2 / by_mean
-        tells = self._alone & (precision > 1e-9 * by_lead)
+        is_wire = np.abs(self.loss_ohm).mean(axis=1) < MOST_LINE_OHM
+        tells = self._alone & is_wire & (precision > 1e-9 * by_lead)
         if not tells.any():
             return 0.0, np.inf
         pull = products[:, 0, 2] - both / by_mean * products[:, 1, 2]
