@@ -99,7 +99,7 @@ class LiveSkin(Closing):
         self._sent = 0  # scans so far with those that were missed before them
         self._changed = Condition()
         # A port that never answers does not hold up the end of the program.
-        self._thread = threading.Thread(target=self._work, name=f"live {port}", daemon=True)
+        self._thread = threading.Thread(target=self._work, name=f"live {self.port}", daemon=True)
         self._thread.start()
 
     def __repr__(self) -> str:
@@ -110,7 +110,7 @@ class LiveSkin(Closing):
     def status(self) -> str:
         """That scans come, or why there are none, in words."""
         said = "gives scans" if self._count and self._device else "is being opened"
-        if self.skipped and not self._count:
+        if self.skipped and self._device and not self._count:
             said = "gives scans, all of them too late: end other programs, or ask for a lower rate"
         if self.closing.is_set():
             said = "was closed"
@@ -171,7 +171,9 @@ class LiveSkin(Closing):
         """
         device, reader, failure = self._device, self._reader, self.failure
         if device is None or reader is None:
-            raise DeviceLost(f"{self.port} is not there: {failure}" if failure else self.status)
+            text = "is being opened" if failure is None else f"is not there: {failure}"
+            text = "was closed" if self.closing.is_set() else text
+            raise DeviceLost(f"{self.port} {text}")
         return device, reader
 
     def tare(self, seconds: float = TARE_S, *, force: bool = False) -> "Tare":

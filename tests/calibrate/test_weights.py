@@ -317,9 +317,9 @@ def test_presses_of_another_size_or_mode_are_not_gone_on_with(
 def test_a_weight_that_is_too_light_to_be_seen_is_asked_after(weigh: Run) -> None:
     """It was waited for without a word."""
     done = weigh([(40.0, [], 0.0)], *OPTIONS, interrupt_s=20.0)
-    assert done.out.count("nothing is seen there: is the weight too light, or another cell") == 1
+    assert done.out.count("no weight is seen yet: if it lies there, it is too light") == 1
     patient = weigh([(40.0, [], 0.0)], *OPTIONS, interrupt_s=10.0)
-    assert "nothing is seen" not in patient.out
+    assert "no weight is seen" not in patient.out
 
 
 def test_wrong_uses_of_weights(run: Run, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from ohmskin.cli.doctor_words import named, verdict, words_of
 from ohmskin.doctor.circuit import examine_circuit
 from ohmskin.doctor.examine import examine
 from ohmskin.doctor.far import examine_far, near_ends
-from ohmskin.doctor.findings import Diagnosis, Kind, LineWire, Severity
+from ohmskin.doctor.findings import WHOLE_SKIN, Diagnosis, Finding, Kind, LineWire, Severity
 from ohmskin.doctor.signal import Rest
 from ohmskin.emulate.driver import SteppedSkin
 from ohmskin.emulate.scenes import LEAD_OHM
@@ -398,6 +398,8 @@ def test_a_wire_below_0_ohm_is_said_to_leak() -> None:
     found = [one for one in diagnosis.findings if one.kind is Kind.LINE_WIRE]
     assert found
     assert all("as a damp one does" in words_of(one)["what_to_do"] for one in found)
+    noise = Finding(Kind.LINE_WIRE, WHOLE_SKIN, {"ohm": -1.0, "std_ohm": 9.0, "usual_ohm": 800.0})
+    assert "of another yarn?" in words_of(noise)["what_to_do"]
 
 
 @pytest.mark.parametrize(

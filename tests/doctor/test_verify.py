@@ -51,10 +51,12 @@ def verified(run: Run, url: str, plate: str, *more: str) -> tuple[int, dict]:
 @pytest.mark.usefixtures("benches")
 def test_errors_are_in_columns_and_an_open_joint_has_none(run: Run, write: Write) -> None:
     """Its error of 579531 % touched the next number."""
-    url = f"emulator://8x8?plate={write(other(PLATE, **{'0,1': None}), 'there')}"
+    there = other(PLATE, **{"0,1": None, "1,4": 2.5 * PLATE[1, 4]})
+    url = f"emulator://8x8?plate={write(there, 'there')}"
     done = run("verify", url, write(PLATE), "--seconds", "1")
-    first = done.out.split("row by row:\n")[1].splitlines()[0]
+    first, second = done.out.split("row by row:\n")[1].splitlines()[:2]
     assert first.split() == [".", "open", *6 * "."]
+    assert float(second.split()[4]) == pytest.approx(150, abs=3)  # it is not open
 
 
 @pytest.mark.parametrize("noise", [0, 0.3, 0.5])

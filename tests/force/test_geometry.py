@@ -140,7 +140,7 @@ def test_a_wrench_of_many_scans_is_that_of_each() -> None:
     placed = Geometry("table", "f", 2, 3, dict(zip(KINDS["table"], table, strict=True)))
     force_n = np.arange(24.0).reshape(4, 2, 3)
     force_n[0, 0, 0], force_n[1] = np.nan, np.nan
-    together = placed.wrench(force_n)
+    together, ones = placed.wrench(force_n), np.ones((2, 3))
     for number in range(4):
         net_n, torque_nm = np.zeros(3), np.zeros(3)
         for cell in np.ndindex(2, 3):
@@ -150,6 +150,7 @@ def test_a_wrench_of_many_scans_is_that_of_each() -> None:
                 torque_nm += np.cross(placed.position_m[cell], on_cell)
         for found in (placed.wrench(force_n[number]), [each[number] for each in together]):
             np.testing.assert_allclose(found, [net_n, torque_nm])
+    np.testing.assert_array_equal(placed.wrench(np.ones((2, 3)).tolist()), placed.wrench(ones))
     for wrong in ((3, 2), (1, 3), (3,), (4, 2)):
         with pytest.raises(ValueError, match="force_n has shape"):
             placed.wrench(np.ones(wrong))
@@ -158,9 +159,9 @@ def test_a_wrench_of_many_scans_is_that_of_each() -> None:
 @pytest.mark.parametrize(
     ("kind", "told", "reason"),
     [
-        ("sphere", {}, "kind 'sphere' and its fields"),
-        ("flat", {}, "kind 'flat' and its fields"),
-        ("flat", {"pitch_m": np.ones(2), "radius_m": np.ones(())}, "kind 'flat' and its fields"),
+        ("sphere", {}, "no kind 'sphere': there are flat, cylinder, table"),
+        ("flat", {}, "kind 'flat' has pitch_m, not $"),
+        ("flat", {"pitch_m": np.ones(2), "radius_m": np.ones(())}, "not pitch_m, radius_m"),
         ("flat", {"pitch_m": np.ones(3)}, r"pitch_m has not the shape \(2,\)"),
         ("table", dict.fromkeys(KINDS["table"], np.ones((2, 3, 3))), r"not the shape \(4, 4, 3\)"),
     ],

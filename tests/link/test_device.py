@@ -420,8 +420,8 @@ def test_a_mean_of_no_time_is_refused(seconds: float) -> None:
 
 def test_a_mean_is_not_of_less_time_than_was_asked_for(tmp_path: Path) -> None:
     """A recording that was shorter gave that of all of it, its touches among them."""
-    path, board = tmp_path / "a.mcap", stepped("emulator://1x1?rate=10")
-    write_recording(path, board.info, [*itertools.islice(board, 11)])
+    path, board = tmp_path / "a.mcap", stepped("emulator://1x1?rate=5")
+    write_recording(path, board.info, [*itertools.islice(board, 5)])
     for seconds in (0.0, 0.5, 1.0):
         with ohmskin.open(f"replay://{path}?speed=0") as skin:
             assert skin.mean_ratio(seconds).shape == (1, 1, 4)

@@ -132,6 +132,7 @@ def test_a_part_has_the_tare_that_held_and_the_board_that_was_there(
     write_recording(path, hello, messages_in_order)
     export(path, tmp_path / "a.npz", begin_s=0.9, end_s=1.1)
     readings = load_readings(tmp_path / "a.npz")
+    assert np.load(tmp_path / "a.npz")["ref_top_ohm"].dtype == np.float64
     np.testing.assert_array_equal(readings.rest_ratio, rests[0])
     assert readings.ref_top_ohm == 10_000
 

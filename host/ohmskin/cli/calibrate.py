@@ -559,7 +559,9 @@ def _wires_in_words(calibration: Calibration, calibrator: Calibrator) -> str:
     ohm, std_ohm = wires.lead or 0.0, wires.lead_std_ohm or 0.0
     if found.lead_disagrees:
         leads = f"; leads of {ohm:.0f} ohm; told: {lead_ohm:g}: they disagree"
-    elif calibrator.found and lead_ohm is None and std_ohm < UNCLEAR_LOG * ohm:
+    elif not calibrator.found:
+        leads = ""  # far ends have their own, near the one that was told
+    elif lead_ohm is None and std_ohm < UNCLEAR_LOG * ohm:
         leads = f"; leads of {ohm:.0f} ohm, {100 * std_ohm / ohm:.0f} %"
     line += leads
     if found.unclear:

@@ -73,7 +73,7 @@ def _words(kind: Kind, lines: tuple[int, ...], values: Mapping[str, Any]) -> dic
         case Kind.HUM:
             return {"mains": " or ".join(f"{hz:.0f} Hz" for hz in values["mains_hz"])}
         case Kind.LINE_WIRE:
-            return {"negative": values["ohm"] < 0}
+            return {"negative": values["ohm"] < -2 * values["std_ohm"]}
         case Kind.WIRES:
             top, bottom = nominal_ohm = values["nominal_ohm"]
             return {"told": _ohm(values["share"], nominal_ohm), "top": top, "bottom": bottom}

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST: Final = Tolerance()
-# Where a resistor is off by as much [%], there is none.
-OPEN_PERCENT: Final = 99.5
 _out = Terminal(soft_wrap=True, highlight=False)
 
 
@@ -101,13 +99,13 @@ def _print_exam(exam: PlateExam) -> None:
     for clock, noise_lsb in exam.noise_lsb.items():
         _out.print(f"{clock:<18}  noise {noise_lsb:.2f} LSB")
     _out.print("\nerror of each resistor in percent, row by row:")
-    for row in exam.error_percent:
-        _out.print("".join(f"{_percent(each):>8}" for each in row))
+    for errors, opens in zip(exam.error_percent, exam.open, strict=True):
+        _out.print(" ".join(f"{_percent(*each):>7}" for each in zip(errors, opens, strict=True)))
 
 
-def _percent(error: float) -> str:
+def _percent(error: float, is_open: bool, digits: int = 2) -> str:
     """An error of a resistor [%], in words."""
-    return "." if np.isnan(error) else f"{error:.2f}" if abs(error) < OPEN_PERCENT else "open"
+    return "open" if is_open else "." if np.isnan(error) else f"{error:.{digits}f}"
 
 
 def _draw(figure: "Figure", exam: PlateExam) -> None:
@@ -126,9 +124,7 @@ def _draw(figure: "Figure", exam: PlateExam) -> None:
         axes.set(xticks=crossings[: values.shape[1]], yticks=crossings[: values.shape[0]])
         for (row, column), value in np.ndenumerate(values):
             colour = "white" if abs(value) > 1.4 * limit else "black"
-            text = (
-                "" if np.isnan(value) else f"{value:.1f}" if abs(value) < OPEN_PERCENT else "open"
-            )
+            text = _percent(value, bool(axes is of_cells and exam.open[row, column]), 1).strip(".")
             if axes is of_cells and exam.wrong[row, column]:
                 text = f"[{text or 'bridge'}]"
             axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=size)

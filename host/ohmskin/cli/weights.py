@@ -224,7 +224,9 @@ def guided(
                 since_us = scan.time_us
             line, now = _step_in_words(step, anywhere)
             if step.state is State.PUT and scan.time_us - since_us > 1e6 * UNSEEN_S:
-                line = "nothing is seen there: is the weight too light, or another cell meant?"
+                line = (
+                    "no weight is seen yet: if it lies there, it is too light: take a heavier one"
+                )
             if line and line != last_line:
                 counted = f"{done} of {total}: " if step.rise is not None else ""
                 TERMINAL.print(counted + line, highlight=False)

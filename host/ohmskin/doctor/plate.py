@@ -101,7 +101,7 @@ class PlateExam:
     cell_ohm: 1 / g, (R, C) [ohm].
     std_percent: its stated deviation, (R, C) [%].
     error_percent: its error, (R, C) [%], NaN where no resistor is.
-    wrong: which cells have a finding, (R, C).
+    wrong: which cells have a finding, (R, C). open: which of them are open joints.
     shown_lsb: s as read, but for the leads, (R, C, 4) [LSB].
     predicted_lsb: s by the circuit, (R, C, 4) [LSB].
     lines: slope, offset and largest residual [LSB] of the straight line, by configuration.
@@ -116,7 +116,7 @@ class PlateExam:
     def __post_init__(self) -> None:
         unknown: Float = np.full(self.plate.shape, np.nan)
         self.cell_ohm = self.std_percent = self.error_percent = self.settling_lsb = unknown
-        self.wrong = np.isfinite(unknown)
+        self.wrong = self.open = np.isfinite(unknown)
         self.shown_lsb: Float = np.full((*unknown.shape, 4), np.nan)
         self.predicted_lsb = self.shown_lsb
         self.lines: dict[str, dict[str, float]] = {}
@@ -219,7 +219,7 @@ class PlateExam:
         is_open, bridged = self._open_and_bridged(estimate)
         most = self.tolerance.cell_percent
         off = ~is_open & (np.abs(self.error_percent) > most + self.std_percent)
-        self.wrong = is_open | bridged | off
+        self.wrong, self.open = is_open | bridged | off, is_open
         for kind, cells, worth in (
             (Kind.OPEN_JOINT, is_open, self.cell_ohm),
             (Kind.BRIDGE, bridged, siemens),

@@ -36,6 +36,9 @@ With it, a skin of a single cell is solved in one step.
 The first frame starts from its ports alone (`cells_of_ports`), and each cell is corrected by its
 own port, G_read rho g in place of g, `CORRECTIONS` times.
 
+`joint` starts from these cells, after one more step that also takes in what it expects of cells and
+wires (`CellFit.nearer`).
+
 Source: the network and its Jacobian are the resistance-matrix approach of Shu et al., IEEE Sensors
 Journal 15(1), 2015; the weights, bounds and standard deviations are ours.
 """
@@ -292,7 +295,8 @@ class CellFit:
     def nearer(self, centre: Float, variance: Float, lost_ohm: Float) -> Float:
         """Logs of the cells' resistances (RC,) [log ohm] after one more step, to the most probable.
 
-        It is one of Gauss-Newton with the last J, without bounds.
+        It is one of Gauss-Newton with the last J. No bound holds a cell, but no log moves by more
+        than `MAX_STEP_LOG`.
 
         centre, variance: what is expected of these logs, a normal, (RC,).
         lost_ohm: what wires and leads add to the resistance of each port, (R, C) [ohm].

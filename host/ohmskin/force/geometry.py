@@ -79,8 +79,11 @@ class Geometry:
     def __post_init__(self) -> None:
         if not (0 < len(self.frame_id) <= _LONGEST_NAME and self.frame_id.isprintable()):
             raise ValueError(f"frame_id must be a name of 1 to {_LONGEST_NAME} characters")
-        if self.kind not in KINDS or self.told.keys() != {*KINDS[self.kind]}:
-            raise ValueError(f"kind {self.kind!r:.40} and its fields must be of {KINDS}")
+        if self.kind not in KINDS:
+            raise ValueError(f"no kind '{self.kind:.40}': there are {', '.join(KINDS)}")
+        if self.told.keys() != {*KINDS[self.kind]}:
+            fields = " and ".join(KINDS[self.kind])
+            raise ValueError(f"kind '{self.kind}' has {fields}, not {', '.join(self.told)[:80]}")
         shapes = {"pitch_m": (2,), "radius_m": ()}
         for name, numbers in self.told.items():
             if np.shape(numbers) != (shape := shapes.get(name, (self.rows, self.columns, 3))):
@@ -138,6 +141,7 @@ class Geometry:
         force_n: (..., R, C); cells without a force do not count, and where none has one, both are
             NaN. Raises ValueError for another shape.
         """
+        force_n = np.asarray(force_n, np.float64)
         if force_n.shape[-2:] != self.normal.shape[:2]:
             raise ValueError(f"force_n has shape {force_n.shape}, the skin {self.normal.shape[:2]}")
         lacks = np.isnan(force_n)

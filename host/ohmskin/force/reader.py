@@ -148,14 +148,15 @@ class SkinReader:
         self.focus: Focus | None = None
         self._calibration, self._ref_log_std = calibration, ref_log_std
         self._wanted = method or (calibration.method if calibration else DEFAULT_METHOD)
-        # All readers of one skin have the same lists and lock, however each reads its scans: a tare
-        # that one takes holds for all, and `calibration` has the wires that any has learned.
+        # Readers that `another` gives have the same three lists and lock as this one: a tare that
+        # one takes holds for all, and `calibration` has the wires that any of them has learned.
+        #
         # The rest of the calibration, or None where there is no calibration; after it, one rest for
         # each tare that was not undone. The last of them is the rest that holds now.
         self._rests: list[Rest | Untouched | None] = [None]
         if calibration is not None:
             self._rests = [calibration.rest, *filter(None, [calibration.tare])]
-        # Of the estimators that have read scans, the one that knows the wires best, if any has.
+        # The estimator that knows the wires best, of those that have read scans; none before.
         self._taught: list[Estimator] = []
         self._recorded: list[Float] = []  # readings of the recorded tares that were taken
         self._lock = threading.Lock()  # two readers may come to the same one in two threads

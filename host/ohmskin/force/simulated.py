@@ -32,7 +32,7 @@ from ohmskin.link.session import Session
 
 # The skin is tared at first by the mean of so many scans. Chosen: as `ohmskin tare` takes them.
 _TARE_SCANS: Final = 90
-# Times are less than so many seconds: in ns, they have 64 bits.
+# Times are less than so many seconds: in ns, they fit into 64 bits.
 _LONGEST_S: Final = 9e9
 
 
@@ -107,7 +107,7 @@ class SimulatedSkin:
         a time.
         """
         if not abs(time_s) < _LONGEST_S:
-            raise ValueError(f"time_s is {time_s:g}, a simulation lasts less than {_LONGEST_S:g} s")
+            raise ValueError(f"time_s is {time_s:g}, it must be a time within {_LONGEST_S:g} s")
         self._force_n = force_n
         codes, mode = self._board.codes_at(time_s), self._settings.mode
         time_us, time_ns = round(1e6 * time_s), round(1e9 * time_s)

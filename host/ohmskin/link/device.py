@@ -40,8 +40,8 @@ QUEUE_SCANS: Final = 1024
 # A command is sent so often before the board counts as lost. Chosen: where a line damages one frame
 # in a hundred, one command in fifty, or its answer, is lost, and three in a row are 8 in a million.
 COMMAND_TRIES: Final = 3
-# A mean is of this share of the time that was asked for, at least. Chosen: a recording of a second
-# has scans of a little less.
+# A mean is of this share of the time that was asked for, at least. Chosen: clocks of boards differ
+# by less.
 _LEAST_SHARE: Final = 0.9
 _S = TypeVar("_S", bound=Scan)
 
@@ -236,8 +236,10 @@ class Device(Closing):
         if not 0 <= seconds < float("inf"):
             raise ValueError(f"no mean of {seconds:g} seconds: say 0 or more, 0 for one scan")
         scans = [*scans_for(self, seconds)]
-        passed_s = 1e-6 * np.diff([scan.time_us for scan in scans]).clip(0).sum()
-        if scans and passed_s < _LEAST_SHARE * seconds:
+        # From the first of n scans to the last is one period less than they take.
+        times_us, count = [scan.time_us for scan in scans], len(scans)
+        passed_us = np.diff(times_us).clip(0).sum() * count / max(count - 1, 1)
+        if scans and passed_us < _LEAST_SHARE * 1e6 * seconds:
             raise ValueError(f"no mean of {seconds:g} seconds: {self.name} ends before")
         return mean_ratio(scans)
 

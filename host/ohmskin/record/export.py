@@ -31,11 +31,11 @@ from ohmskin.record.recording import Mark, Tare, messages, tare_of
 # Attributes of `Scan` that both formats have besides the readings, and their types.
 _OF_SCAN: Final = {"number": "<i8", "time_us": "<i8", "host_time_s": "<f8", "missed": "<i8"}
 # What a readings file has of the board.
-_OF_BOARD: Final = ("ref_top_ohm", "ref_bottom_ohm", "adc_bits")
+_OF_BOARD: Final = {"ref_top_ohm": "<f8", "ref_bottom_ohm": "<f8", "adc_bits": "<i8"}
 # Type of the readings in a readings file: codes are exact in the 24 bits of single precision.
 _RATIO: Final = np.dtype("<f4")
 # What a code means, by what a board says of itself.
-_means: Final = attrgetter("ref_top_ohm", "ref_bottom_ohm", "adc_bits")
+_means: Final = attrgetter(*_OF_BOARD)
 
 
 def save_stacked(out: Path, parts: Iterable[Mapping[str, NDArray[Any]]]) -> None:
@@ -210,7 +210,7 @@ def _arrays(
         of_scan = {name: np.array([getattr(scan, name)], _OF_SCAN[name]) for name in _OF_SCAN}
         yield of_scan | {"ratio": _of_names(scan, scan.ratio, names)[None].astype(_RATIO)}
         tare = tare_of(scan, part.tares)  # now: tares that come after the part are read, too
-    yield {name: np.array(getattr(part.boards[0], name)) for name in _OF_BOARD}
+    yield {name: np.array(getattr(part.boards[0], name), _OF_BOARD[name]) for name in _OF_BOARD}
     yield {"reading_names": np.array(names)}
     if tare is not None:
         at_rest = replace(scan, mode=tare.mode, row_mask=0, column_mask=0)
