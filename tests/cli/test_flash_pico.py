@@ -27,7 +27,7 @@ def media(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(flash_command, "_ROOT", tmp_path)
     monkeypatch.setattr(flash_command, "_FIRMWARE", tmp_path)
     monkeypatch.setattr(pico, "_PLACES", (f"{tmp_path}/media/*",))
-    monkeypatch.setattr(pico, "_APPEARS_S", 0.0)
+    monkeypatch.setattr(pico, "APPEARS_S", 0.0)
     return tmp_path / "media"
 
 

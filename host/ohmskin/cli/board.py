@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from functools import partial
 from itertools import islice
@@ -258,8 +258,8 @@ def flash(
         built = _ROOT / "firmware" / "pico" / "build" / "ohmskin.uf2"
         firmware = built if (_ROOT / "platformio.ini").is_file() else _FIRMWARE / "pico.uf2"
         TERMINAL.print(f"copied to {pico.copy_firmware(firmware, port)}")
-        port = pico.port_of_pico()
-        TERMINAL.print(f"{port}: pico, firmware {_answer(port).version}, answers")
+        port, hello = _answer(pico.port_of_pico, pico.APPEARS_S)
+        TERMINAL.print(f"{port}: pico, firmware {hello.version}, answers")
         return
     board, port = _chosen(board, port, serial_ports())
     packages = _ROOT / ".pio" / "core"  # where `make setup` puts them
@@ -276,7 +276,7 @@ def flash(
             raise OhmskinError(f"no boot loader answers at {port}: {hint}")
         TERMINAL.print(done.stdout)
         raise OhmskinError(f"flashing {board} at {port} failed: the lines above say why")
-    hello = _answer(port)
+    port, hello = _answer(lambda: port, SILENCE_TIMEOUT_S)
     if hello.board != ("uno" if board == "nano" else board):  # the same chip, and the same wiring
         raise OhmskinError(f"{port} answers as '{hello.board}', not as {board}: flash that one")
     TERMINAL.print(f"{port}: {board}, firmware {hello.version}, answers")
@@ -332,17 +332,18 @@ def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str
     )
 
 
-def _answer(port: str) -> Hello:
-    """What the flashed board says of itself.
+def _answer(find_port: Callable[[], str], seconds: float) -> tuple[str, Hello]:
+    """The port of the flashed board, and what the board says of itself. It may take so long.
 
-    As after every reset, it counts as lost after `SILENCE_TIMEOUT_S`: it is in its boot loader for
-    up to 3 s, and its port may be gone meanwhile.
+    As after every reset, it is in its boot loader for up to 3 s, and its port may be gone
+    meanwhile.
     """
-    deadline_s = time.monotonic() + SILENCE_TIMEOUT_S
+    deadline_s = time.monotonic() + seconds
     while True:
         try:
+            port = find_port()
             with ohmskin.open(port, start=False) as skin:
-                return skin.info
+                return port, skin.info
         except (PortError, DeviceLost):
             if time.monotonic() > deadline_s:
                 raise

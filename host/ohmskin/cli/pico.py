@@ -4,7 +4,6 @@
 import os
 import shutil
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -20,9 +19,9 @@ _PLACES: Final = ("/media/*", "/media/*/*", "/run/media/*/*", "/mnt/*", "/Volume
 _INFO: Final = "INFO_UF2.TXT"
 _BOARD_ID: Final = b"Board-ID: RPI-RP2"
 _INFO_MOST_BYTES: Final = 4096
-# How long a Pico that was flashed may take until its port is there [s]. Chosen: USB takes one.
-_APPEARS_S: Final = 10.0
-_LOOK_EVERY_S: Final = 0.2
+# How long a Pico that was flashed may take until its port is there, and answers [s]. Chosen: USB
+# takes one.
+APPEARS_S: Final = 10.0
 
 
 def copy_firmware(firmware: Path, drive: str) -> Path:
@@ -52,18 +51,14 @@ def copy_firmware(firmware: Path, drive: str) -> Path:
 
 
 def port_of_pico() -> str:
-    """The serial port of the Pico that was flashed, as soon as it is there.
+    """The serial port of the Pico that was flashed.
 
-    :raises PortError: none has come, or more than one is there.
+    :raises PortError: none is there, or more than one.
     """
-    deadline_s = time.monotonic() + _APPEARS_S
-    while True:
-        ports = [port.path for port in serial_ports() if port.board == "pico"]
-        if len(ports) == 1:
-            return ports[0]
-        if time.monotonic() > deadline_s:
-            raise PortError(f"{len(ports) or 'no'} ports are those of a Pico: plug it in again")
-        time.sleep(_LOOK_EVERY_S)
+    ports = [port.path for port in serial_ports() if port.board == "pico"]
+    if len(ports) != 1:
+        raise PortError(f"{len(ports) or 'no'} ports are those of a Pico: plug it in again")
+    return ports[0]
 
 
 def _drives() -> Iterator[Path]:
