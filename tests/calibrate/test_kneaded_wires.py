@@ -16,7 +16,7 @@ from ohmskin.calibrate.kneaded_wires import (
     likely_wires,
 )
 from ohmskin.calibrate.scale import Scale
-from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
+from ohmskin.calibrate.totals import TotalFit, Totals
 from ohmskin.estimate.knowledge import NO_WIRES, WireOhm
 
 SHAPE, PRESSES, STEP_S, PERIOD_S = (4, 5), 160, 0.02, 0.6
@@ -120,8 +120,8 @@ def test_a_step_that_is_too_long_is_halved(monkeypatch: pytest.MonkeyPatch) -> N
     """Where presses told little of the wires, one step led to 1.4 kohm, and to no way back."""
     skin, usual = Skin(100.0, 200.0), TotalFit.wires
 
-    def overdone(fit: TotalFit, slopes: WireSlopes) -> tuple[Float, Float]:
-        change, covariance = usual(fit, slopes)
+    def overdone(fit: TotalFit, *given: Float) -> tuple[Float, Float]:
+        change, covariance = usual(fit, *given)
         return (5 if change.size == 2 else 1) * change, covariance  # of both layers
 
     monkeypatch.setattr(TotalFit, "wires", overdone)
@@ -139,8 +139,8 @@ def test_a_step_that_was_too_long_is_not_taken_with_more_scans(
     cells: list[int] = []
     misfits: list[float] = []
 
-    def overdone(fit: TotalFit, slopes: WireSlopes) -> tuple[Float, Float]:
-        change, covariance = usual(fit, slopes)
+    def overdone(fit: TotalFit, *given: Float) -> tuple[Float, Float]:
+        change, covariance = usual(fit, *given)
         return (8 if change.size == 2 else 1) * change, covariance
 
     def noted(fit: TotalFit) -> float:
@@ -236,7 +236,7 @@ def test_the_filter_of_the_scale_is_kept_near_the_wires_alone(
     scales.clear()
     far = np.array([0.0, 5.0]), np.eye(2)  # each step is a long one
     even = np.zeros(3), np.eye(3)  # and no lead is unlike the others
-    monkeypatch.setattr(TotalFit, "wires", lambda _, by: far if by.std.size == 2 else even)
+    monkeypatch.setattr(TotalFit, "wires", lambda *given: far if given[-1].size == 2 else even)
     WireSearch(NO_WIRES, SHAPE, Skin(100.0, 200.0).show).found()
     assert set(scales) == {None}
 

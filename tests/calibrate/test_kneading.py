@@ -22,7 +22,7 @@ from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.scale import Scale, fit_scale, printed_s, wrong_numbers
 from ohmskin.calibrate.sessions import joined
 from ohmskin.calibrate.tables import ForceLog
-from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
+from ohmskin.calibrate.totals import TotalFit, Totals
 from ohmskin.estimate.base import Estimator
 from ohmskin.estimate.knowledge import SkinKnowledge
 from ohmskin.estimate.methods import make_estimator
@@ -480,7 +480,7 @@ def test_the_power_law_of_a_curve_that_bends_is_right_where_forces_are_large() -
     assert fit.largest_n == pytest.approx(shown_n.max(), rel=0.1)  # of a press, not of a cell
 
 
-def kneaded_behind_wires() -> tuple[Totals, WireSlopes]:
+def kneaded_behind_wires() -> tuple[Totals, tuple[np.ndarray, ...]]:
     """Presses with hysteresis and unseen force, and what wires would do, if nobody told them."""
     time_s, press, force_n = presses(5, 240)
     phase = time_s % 0.6
@@ -496,26 +496,26 @@ def kneaded_behind_wires() -> tuple[Totals, WireSlopes]:
     # The further a cell is, and the harder it is pressed, the less it shows with such wires.
     far = np.array([[0, 1, 2, 3] * 3, [0] * 4 + [1] * 4 + [2] * 4])
     slopes = 0.05 * far[:, None, :] * rise / 1e-4
-    return totals, WireSlopes(slopes, np.zeros(2), np.full(2, 1.5))
+    return totals, (slopes, np.zeros(2), np.full(2, 1.5))
 
 
 def test_hysteresis_and_unseen_force_are_not_taken_for_wires() -> None:
-    totals, slopes = kneaded_behind_wires()
+    totals, given = kneaded_behind_wires()
     found = TotalFit(totals, for_wires=True).fit()
-    assert np.abs(found.wires(slopes)[0]).max() < 0.35
+    assert np.abs(found.wires(*given)[0]).max() < 0.35
     assert abs(found.scale_.lag_s) < 2e-3
 
 
 def test_few_presses_that_are_estimated_wrong_are_not_taken_for_wires() -> None:
     """Two of 240 made the logs of the wires 3 too large, and were no outliers then."""
-    totals, slopes = kneaded_behind_wires()
-    usual = TotalFit(totals, for_wires=True).fit().wires(slopes)[0]
+    totals, given = kneaded_behind_wires()
+    usual = TotalFit(totals, for_wires=True).fit().wires(*given)[0]
     hardest = [totals.rise[totals.press == n].sum(axis=1).max() for n in range(240)]
     wrong = np.isin(totals.press, np.argsort(hardest)[-2:])
     rise = totals.rise * np.where(wrong, 1.2, 1.0)[:, None]
     fit = TotalFit(totals._replace(rise=rise), for_wires=True).fit()
     assert fit.presses_left_out == 0
-    assert np.abs(fit.wires(slopes)[0] - usual).max() < 0.2
+    assert np.abs(fit.wires(*given)[0] - usual).max() < 0.2
 
 
 def test_total_and_an_indenter_exclude_each_other(run: Run, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.scale import Scale
-from ohmskin.calibrate.totals import TotalFit, Totals, WireSlopes
+from ohmskin.calibrate.totals import TotalFit, Totals
 from ohmskin.calibrate.wires import (
     ODD_LINES,
     UNTOLD_LEAD_STD_OHM,
@@ -87,7 +87,7 @@ HELD_LOG_STD, HELD_LEAD_STD_OHM = 1e-3, 1e-3
 class Shown(NamedTuple):
     """What an estimator shows of the scans that is told some wires.
 
-    slopes: how its rises follow both layers and each lead, as in `WireSlopes`, (2+R+C, m, C).
+    slopes: how its rises follow both layers and each lead, d log x / dw, (2+R+C, m, C).
     scans: the m scans of these slopes; all others have none, because nothing is pressed.
     wires: these wires, with what the scans have taught.
     """
@@ -184,8 +184,7 @@ class WireSearch:
         wires = held(WireOhm(top_ohm, bottom_ohm, self._lead[0]))
         shown = self._show(wires, self._own_ohm, self._most_cells)
         fit = TotalFit(shown.totals, self._scale, for_wires=True).fit()
-        off = self._centre - u
-        by_wires = fit.wires(WireSlopes(shown.by_wires([0, 1]), off, self._std))
+        by_wires = fit.wires(shown.by_wires([0, 1]), self._centre - u, self._std)
         trial = _Trial(u, shown, fit, fit.misfit(), *by_wires)
         if self._most_cells == TRIAL_CELLS and trial.is_close(SHORT_STEP, 0.0):
             self._scale = fit.scale_
@@ -213,8 +212,8 @@ class WireSearch:
         centre = np.append(self._centre - trial.held, 0.0)
         std = np.append(self._std, UNTOLD_LEAD_STD_OHM)
         for line in range(sum(self._shape)):
-            of_line = WireSlopes(trial.shown.by_wires([0, 1, 2 + line]), centre, std)
-            change, covariance = trial.fit.wires(of_line)
+            slopes = trial.shown.by_wires([0, 1, 2 + line])
+            change, covariance = trial.fit.wires(slopes, centre, std)
             found.append((line, float(change[2]), float(change[2] / covariance[2, 2] ** 0.5)))
         return max(found, key=lambda one: abs(one[2]))
 

@@ -177,14 +177,6 @@ class Totals(NamedTuple):
     lags: bool = True
 
 
-class WireSlopes(NamedTuple):
-    """How the rises follow the wires: d log x / dw, (k, n, C); prior of w, centre and std (k,)."""
-
-    slopes: Float
-    centre: Float
-    std: Float
-
-
 class TotalFit:
     """The fit of the module's equations.
 
@@ -412,8 +404,11 @@ class TotalFit:
 
     # ------------------------------------------------------------------------------ the answer
 
-    def wires(self, given: WireSlopes) -> tuple[Float, Float]:
+    def wires(self, slopes: Float, centre: Float, std: Float) -> tuple[Float, Float]:
         """The change w of the wires that fits best, (k,), and its covariance, (k, k).
+
+        slopes: how the rises follow the wires, d log x / dw, (k, n, C).
+        centre, std: the prior of w, (k,).
 
         It is one step of Gauss-Newton of p and w together. More steps would follow the slopes to
         wires for which they do not hold.
@@ -422,17 +417,16 @@ class TotalFit:
 
         log_contact, steeper, _ = self._contact()
         b = self._p[1] + self._p[self._of_bends]
-        forces = np.sum(self._parts(log_contact) * b * steeper * given.slopes, axis=2)
+        forces = np.sum(self._parts(log_contact) * b * steeper * slopes, axis=2)
         precision, pull = self._prior()
-        of_wires = given.std**-2.0
+        of_wires = std**-2.0
         precision, pull = self._equations(
             np.hstack([self._shown(forces.T), self._jacobian()]),
             block_diag(np.diag(of_wires), precision),
-            np.concatenate([of_wires * given.centre, pull]),
+            np.concatenate([of_wires * centre, pull]),
         )
-        count = given.std.size
-        covariance = np.asarray(np.linalg.inv(precision)[:count, :count])
-        return np.asarray(np.linalg.solve(precision, pull)[:count]), covariance
+        covariance = np.asarray(np.linalg.inv(precision)[: std.size, : std.size])
+        return np.asarray(np.linalg.solve(precision, pull)[: std.size]), covariance
 
     @property
     def presses(self) -> int:
