@@ -44,7 +44,7 @@ The s that a curve is kept with differs from that of the fit in three ways:
 A cell with fewer presses than a curve needs has the curve of all presses times its gain (`gains`).
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any, Final, NamedTuple, Self
 
@@ -82,6 +82,8 @@ EXPONENTS: Final = np.geomspace(MIN_EXPONENT, MAX_EXPONENT, 33)
 # Presses that fit exactly count as scattered by this share of their force, so that the logarithm of
 # their scatter is finite. Chosen: far below what any force sensor resolves.
 _LEAST_SHARE: Final = 1e-6
+# What a curve says of its errors.
+_ERRORS: Final = ("residual_std", "residual_share", "held_out_rmse")
 
 
 class ForceRegression:
@@ -121,13 +123,11 @@ class ForceRegression:
             press=_array("press", np.arange(size) if press is None else press, size, np.intp),
         )
         _check(rows, shape)
-        curves, own = _curves_by_gain(rows, shape[0] * shape[1]), _curves_of_cells(rows)
+        columns, own = _curves_by_gain(rows, shape[0] * shape[1]), _curves_of_cells(rows)
         for cell, curve in own.items():
-            curves[cell] = curve
-        arrays = {
-            field.name: np.array([getattr(curve, field.name) for curve in curves]).reshape(shape)
-            for field in fields(Curve)
-        }
+            for name, value in vars(curve).items():
+                columns[name][cell] = value
+        arrays = {name: np.array(column).reshape(shape) for name, column in columns.items()}
         is_unknown = np.isnan(arrays["residual_std"])
         pooled = np.ones(shape, dtype=bool)
         pooled.flat[rows.cell] = False
@@ -158,8 +158,8 @@ class _Rows(NamedTuple):
     press: NDArray[np.intp]
 
 
-def _curves_by_gain(rows: _Rows, cells: int) -> list[Curve]:
-    """The curve of all presses, times the gain of each of so many cells."""
+def _curves_by_gain(rows: _Rows, cells: int) -> dict[str, list[Any]]:
+    """The curve of all presses, times the gain of each of so many cells: columns of `Curve`."""
     is_one_cell = np.unique(rows.cell).size == 1
     # Whole cells are held out: what counts is the error on cells that nobody pressed.
     alike, parts = (rows.press, PRESS_FOLDS) if is_one_cell else (rows.cell, MAX_CELL_FOLDS)
@@ -168,27 +168,18 @@ def _curves_by_gain(rows: _Rows, cells: int) -> list[Curve]:
     if curve is None:
         raise ValueError("force does not rise with the cells' rise: is the rest of this skin?")
     error_n = trial.errors.get((curve.kind, False))
-    if is_one_cell or error_n is None:  # nothing tells how large the error is on other cells
-        nan = np.nan
-        return [replace(curve, residual_std=nan, residual_share=nan, held_out_rmse=nan)] * cells
-    curve_n = np.maximum(force_by(curve, rows.x), 0.0)
-    held_out_n = rows.force - error_n
-    gains = find_gains(rows.press, rows.cell, rows.force, curve_n, held_out_n, cells)
-    share = curve.slope_std / curve.slope
-    shares = np.maximum(np.hypot(share, gains.std / gains.gain), 1e-30)
-    slopes = curve.slope * gains.gain
-    of_cells = slopes, slopes * shares, curve.correlation * share / shares, gains.held_out_rmse
-    return [
-        replace(
-            curve,
-            slope=slope,
-            slope_std=slope_std,
-            correlation=correlation,
-            residual_std=gains.scatter_n,
-            held_out_rmse=held_out_rmse,
-        )
-        for slope, slope_std, correlation, held_out_rmse in np.transpose(of_cells).tolist()
-    ]
+    of_cells = vars(curve) | dict.fromkeys(_ERRORS, np.nan)
+    if not (is_one_cell or error_n is None):  # else nothing tells the error on other cells
+        curve_n = np.maximum(force_by(curve, rows.x), 0.0)
+        held_out_n = rows.force - error_n
+        gains = find_gains(rows.press, rows.cell, rows.force, curve_n, held_out_n, cells)
+        share = curve.slope_std / curve.slope
+        shares = np.maximum(np.hypot(share, gains.std / gains.gain), 1e-30)
+        slopes = curve.slope * gains.gain
+        of_cells |= {"slope": slopes, "slope_std": slopes * shares}
+        of_cells |= {"correlation": curve.correlation * share / shares}
+        of_cells |= dict(zip(_ERRORS, (gains.scatter_n, 0.0, gains.held_out_rmse), strict=True))
+    return {name: np.broadcast_to(value, cells).tolist() for name, value in of_cells.items()}
 
 
 def _curves_of_cells(rows: _Rows) -> dict[int, Curve]:
