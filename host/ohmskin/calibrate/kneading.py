@@ -41,7 +41,7 @@ from ohmskin.calibrate.totals import TotalFit, Totals, check_weighed
 from ohmskin.circuit.ports import PortCircuit
 from ohmskin.circuit.small import one_blas_thread, solve_positive
 from ohmskin.estimate.base import TOUCH_SIEMENS, Estimator
-from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, WireOhm
+from ohmskin.estimate.knowledge import MIN_CELL_SIEMENS, SkinKnowledge, WireOhm
 from ohmskin.estimate.methods import make_estimator
 from ohmskin.estimate.port_readings import PortReader
 from ohmskin.estimate.prior import UNLIMITED_STD
@@ -98,16 +98,15 @@ class Kneading:
     def __init__(self, calibrator: Calibrator, recordings: list[Recording]) -> None:
         self._calibrator, knowledge = calibrator, calibrator.knowledge
         self.shape = knowledge.rows, knowledge.columns
-        rests = [given.tares[0].rest_ratio for given in recordings[:-1]]
-        self._knowledge = [*(replace(knowledge, rest_ratio=rest) for rest in rests), knowledge]
+        self._rests = [given.tares[0].rest_ratio for given in recordings[:-1]]
+        self._rests.append(calibrator.rest_ratio)
         self._scans = scans = [scan for given in recordings for scan in given.scans]
         numbers = np.arange(len(recordings))
         self._recording = np.repeat(numbers, [len(given.scans) for given in recordings])
         currents = []
-        for known, given in zip(self._knowledge, recordings, strict=True):
-            reader = PortReader(known)
-            assert known.rest_ratio is not None
-            rest = reader.read(known.rest_ratio).current
+        for rest_ratio, given in zip(self._rests, recordings, strict=True):
+            reader = PortReader(replace(knowledge, rest_ratio=rest_ratio))
+            rest = reader.read(rest_ratio).current
             for scan in given.scans:
                 currents.append(reader.read(scan.ratio, in_order=True).current - rest)
         rise = np.array(currents).reshape(len(scans), -1)
@@ -132,16 +131,14 @@ class Kneading:
         calibrator = self._calibrator
         if not lags:
             self._weighed = np.isfinite(log.at(self.time_s)) & (self._press >= 0)
-        wires, are_sure = calibrator.knowledge.nominal_wire_ohm, not calibrator.shows_wires
-        if are_sure:
-            search = WireSearch(wires, self.shape, partial(self._shown, log, progress))
-            calibrator.take_wires(search.found())
+        told = calibrator.knowledge
+        if not calibrator.shows_wires:
+            show = partial(self._shown, log, progress)
+            calibrator.take_wires(WireSearch(told.nominal_wire_ohm, self.shape, show).found())
             # The curves are of the wires that were found, and not of what scans would teach.
             wires = held(calibrator.knowledge.nominal_wire_ohm)
-        own_ohm = calibrator.knowledge.own_lead_ohm
-        levels = self._levels(
-            calibrator.method, wires, own_ohm, self._spaced(), progress, are_sure=are_sure
-        )
+            told = replace(calibrator.knowledge, nominal_wire_ohm=wires, are_wires_sure=True)
+        levels = self._levels(calibrator.method, told, self._spaced(), progress)
         calibrator.estimator = levels.estimator
         return TotalFit(self._totals(levels, log)).fit()
 
@@ -181,26 +178,17 @@ class Kneading:
         self, log: ForceLog, progress: Progress, wires: WireOhm, own_ohm: Float, most_cells: int
     ) -> Shown:
         """What these wires, and what single leads have above them, make of some presses."""
-        used = self._in_stretches(log, most_cells)
-        levels = self._levels(DEFAULT_METHOD, wires, own_ohm, used, progress)
+        known, used = self._calibrator.knowledge, self._in_stretches(log, most_cells)
+        told = replace(known, nominal_wire_ohm=wires, own_lead_ohm=own_ohm)
+        levels = self._levels(DEFAULT_METHOD, told, used, progress)
         wires = levels.estimator.wires()
         return Shown(self._totals(levels, log), *self._slopes(wires, levels), wires)
 
-    def _levels(
-        self,
-        method: str,
-        wires: WireOhm,
-        own_ohm: Float | None,
-        used: Bool,
-        progress: Progress,
-        *,
-        are_sure: bool = False,
-    ) -> _Levels:
+    def _levels(self, method: str, told: SkinKnowledge, used: Bool, progress: Progress) -> _Levels:
         """What a method shows of the scans to use, (n,); those that it doubts are left out.
 
-        wires: what is known of them. What a recording teaches of them is known in the next one.
-        own_ohm: what single leads have above the mean, (R+C,).
-        are_sure: whether they are as told, and not on trial.
+        told: what is known, but for the rest, which each recording has of its own. What a recording
+            teaches of the wires is known in the next one.
         """
         pressed = self._press >= 0
         pauses = np.flatnonzero(used & ~pressed)
@@ -208,23 +196,22 @@ class Kneading:
         wanted[pauses[:: pauses.size // PAUSE_SCANS + 1]] = True
         cells, estimator = self.shape[0] * self.shape[1], self._calibrator.estimator
         rise, good = np.zeros((used.size, cells)), used.copy()
-        rests = np.zeros((len(self._knowledge), cells))
+        rests = np.zeros((len(self._rests), cells))
         numbers, doubt = np.flatnonzero(wanted), ""
         scans = zip(numbers, progress([self._scans[n] for n in numbers]), strict=True)
         for recording, given in groupby(scans, lambda scan: self._recording[scan[0]]):
-            known = self._knowledge[recording]
-            knowledge = replace(
-                known, nominal_wire_ohm=wires, own_lead_ohm=own_ohm, are_wires_sure=are_sure
-            )
-            estimator = make_estimator(method, knowledge)
+            told = replace(told, rest_ratio=self._rests[recording])
+            estimator = make_estimator(method, told)
             rest = rests[recording] = estimator.rest_level().ravel()
             for n, scan in given:
                 answer = estimator.estimate(scan.ratio)
                 good[n], rise[n] = answer.converged, answer.level.ravel() - rest
                 doubt = answer.message or doubt
             # Levels of all recordings are of one curve. What far ends show is no part of it.
-            learned = estimator.wires()
-            wires = learned if self._calibrator.shows_wires else learned.for_curves_of(wires)
+            wires = estimator.wires()
+            if not self._calibrator.shows_wires:
+                wires = wires.for_curves_of(told.nominal_wire_ohm)
+            told = replace(told, nominal_wire_ohm=wires)
         read = wanted & pressed
         if read.any() and not good[read].any():
             remedy = "'ohmskin doctor PORT' looks for the cause"
