@@ -126,6 +126,10 @@ class _Trial(NamedTuple):
         least = np.maximum(short, stds * np.sqrt(self.covariance.diagonal()))
         return bool((np.abs(self.step) < least).all())
 
+    def is_likely(self, best: "_Trial") -> bool:
+        """Whether it is about as likely as the best one so far, or more."""
+        return self.misfit <= best.misfit + LIKELY / best.fit.presses
+
 
 class WireSearch:
     """Looks for the wires.
@@ -156,7 +160,8 @@ class WireSearch:
         best = self._nearest(self._trial(best.held + step), LAST_STEP, CLOSE_STDS[1])
         u, stds = likely_wires(best.held, best.change, best.covariance, self._centre, self._std)
         if np.abs(u - best.held).max() > LAST_STEP:
-            best, _ = self._tried(u, best, 1)
+            trial = self._trial(u)
+            best = trial if trial.is_likely(best) else best
             u = best.held
         (top_ohm, bottom_ohm), (top_std, bottom_std) = np.exp(u).tolist(), stds.tolist()
         lead_ohm, lead_std_ohm = self._lead
@@ -218,27 +223,17 @@ class WireSearch:
         return max(found, key=lambda one: abs(one[2]))
 
     def _nearest(self, best: _Trial, short: float, stds: float) -> _Trial:
-        """The last trial that is kept, of steps until they are short."""
-        left = TRIALS
-        while left and not best.is_close(short, stds):
-            before = best
-            best, left = self._tried(best.held + best.step, best, left)
-            if best is before:
-                break
-        return best
+        """The last trial that is kept, of steps until they are short.
 
-    def _tried(self, u: Float, best: _Trial, left: int) -> tuple[_Trial, int]:
-        """A trial of u, or halfway to the best one, that is about as likely as that one or more.
-
-        left: how many trials there may be. Returns the best trial if there is none, and how many
-        are left.
+        A trial is kept if it is likely beside the one before. If not, half of the step is tried.
         """
-        while left and np.abs(u - best.held).max() > LAST_STEP:
-            trial, left = self._trial(u), left - 1
-            if trial.misfit <= best.misfit + LIKELY / best.fit.presses:
-                return trial, left
-            u = 0.5 * (best.held + u)
-        return best, left
+        step = best.step
+        for _ in range(TRIALS):
+            if best.is_close(short, stds) or np.abs(step).max() <= LAST_STEP:
+                break
+            trial = self._trial(best.held + step)
+            best, step = (trial, trial.step) if trial.is_likely(best) else (best, 0.5 * step)
+        return best
 
 
 def held(wires: WireOhm) -> WireOhm:
