@@ -248,15 +248,6 @@ class _Expected(NamedTuple):
     series_ohm: float
 
 
-class _Best(NamedTuple):
-    """A minimum: -2 log of the evidence, p, the covariance of p (7, 7), the roots of v (6,)."""
-
-    score: float
-    p: Float
-    covariance: Float
-    scatter: Float
-
-
 @one_blas_thread
 def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     """The wires by presses. knowledge: of the skin, with its rest readings and what was told.
@@ -268,21 +259,20 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
     rest = PortReader(knowledge).read(knowledge.rest_ratio)
     rows = _rows(readings, rest.current.ravel())
     own_ohm = trial_ohm = np.zeros(sum(shape))
-    fit, best = trial_fit, trial = _best_fit(knowledge, rows, rest, own_ohm)
-    even_score = best.score
+    even = fit = trial = _best_fit(knowledge, rows, rest, own_ohm)
     # One odd lead hides another. So the next one is sought even before the first one is clear.
     for count in range(1, 1 + int(ODD_LINES * own_ohm.size)):
-        odd = trial_fit.oddest_line(trial)
+        odd = trial.oddest_line()
         if odd is None or not odd.is_lead:
             break
         trial_ohm = trial_ohm.copy()
         trial_ohm[odd.line] += odd.ohm
-        trial_fit, trial = _best_fit(knowledge, rows, rest, trial_ohm)
-        if even_score - trial.score > count * ODD_STDS**2:
-            own_ohm, fit, best = trial_ohm, trial_fit, trial
-    odd = fit.oddest_line(best)
+        trial = _best_fit(knowledge, rows, rest, trial_ohm)
+        if even.score - trial.score > count * ODD_STDS**2:
+            own_ohm, fit = trial_ohm, trial
+    odd = fit.oddest_line()
     is_stripe = odd is not None and not odd.is_lead and abs(odd.stds) > ODD_STDS
-    p, std = best.p, np.sqrt(best.covariance.diagonal())
+    p, std = fit.p, np.sqrt(fit.covariance.diagonal())
     top_ohm, bottom_ohm = np.exp(p[:2]).tolist()
     lead_ohm, lead_std_ohm = (UNKNOWN_LEAD_OHM * float(lead) for lead in (p[2], std[2]))
     top_std, bottom_std = std[:2].tolist()
@@ -299,7 +289,7 @@ def find_wires(knowledge: SkinKnowledge, readings: PressReadings) -> FoundWires:
 
 def _best_fit(
     knowledge: SkinKnowledge, rows: _Rows, rest: PortReadings, own_ohm: Float
-) -> tuple["_PressFit", _Best]:
+) -> "_PressFit":
     """The most probable fit, where single leads have so much above the others (R+C,) [ohm].
 
     rest: readings of the untouched skin.
@@ -313,10 +303,9 @@ def _best_fit(
     tried = []
     for wires, cost in costs.items():
         known = replace(knowledge, nominal_wire_ohm=wires)
-        fit = _PressFit(known, rows, rest, own_ohm)
-        found = fit.minimised()
-        tried.append((fit, found._replace(score=cost + found.score)))
-    return min(tried, key=lambda one: one[1].score)
+        tried.append(_PressFit(known, rows, rest, own_ohm))
+        tried[-1].score += cost
+    return min(tried, key=lambda fit: fit.score)
 
 
 def unclear_layers(logs: Float, stds: Float, shape: tuple[int, int]) -> tuple[str, ...]:
@@ -364,7 +353,12 @@ def wire_prior(told: WireOhm) -> tuple[Float, Float]:
 
 
 class _PressFit:
-    """Fits wires and law to the rows of presses."""
+    """The fit of wires and law to the rows of presses: the most probable p and v.
+
+    score: -2 log of the evidence.
+    p, covariance: as in the module's table, and that of p, (7, 7).
+    scatter: roots of v, (6,).
+    """
 
     def __init__(
         self, knowledge: SkinKnowledge, rows: _Rows, rest: PortReadings, own_ohm: Float
@@ -387,6 +381,7 @@ class _PressFit:
         self._trial = lru_cache(maxsize=8)(self._solved)
         self._set_priors(knowledge.nominal_wire_ohm)
         self._set_blocks()
+        self._minimise()
 
     def _set_priors(self, told: WireOhm) -> None:
         """Centre and deviation of p, by what was told."""
@@ -482,8 +477,8 @@ class _PressFit:
 
     # ----------------------------------------------------------------------------- the search
 
-    def minimised(self) -> _Best:
-        """The most probable p and v."""
+    def _minimise(self) -> None:
+        """Find the most probable p and v."""
         from scipy.optimize import least_squares
 
         p, scatter = self._start(), SCATTER
@@ -506,10 +501,10 @@ class _PressFit:
         precision = found.jac.T @ found.jac
         # Of the likelihood times the prior, by Laplace's integral over p.
         score += float(from_centre @ from_centre) + 2 * float(np.log(self._std).sum())
-        score += float(np.linalg.slogdet(precision)[1])
-        return _Best(score, p, np.linalg.inv(precision), scatter)
+        self.score = score + float(np.linalg.slogdet(precision)[1])
+        self.p, self.covariance, self.scatter = p, np.linalg.inv(precision), scatter
 
-    def oddest_line(self, best: _Best) -> LineExcess | None:
+    def oddest_line(self) -> LineExcess | None:
         """The line whose lead, or segments, are the most unlike the others'; None if none is.
 
         With y' = y - d x, of which d is by a lead of the line, or by each of its segments, and J
@@ -519,9 +514,9 @@ class _PressFit:
 
         all of them whitened by C. Its deviation is (d^T Q d)^-1/2.
         """
-        model = self._expected(best.p)
-        whitener = self._whitener(model, best.scatter)
-        residual, slopes = self._residual(best.p, whitener), self._slopes(best.p, whitener)
+        model = self._expected(self.p)
+        whitener = self._whitener(model, self.scatter)
+        residual, slopes = self._residual(self.p, whitener), self._slopes(self.p, whitener)
         basis, _ = np.linalg.qr(slopes)
         residual -= basis @ (basis.T @ residual)
         by_path = np.where(self._is_row, model.by_path[self._block], 0.0)
@@ -533,7 +528,7 @@ class _PressFit:
                 continue
             segments = 1.0 if is_lead else 1.0 + (row if is_column else column)
             by_ohm = whitener(by_path * (on_line * segments)[:, None]).ravel()
-            slope = np.append(by_ohm, np.zeros(best.p.size))
+            slope = np.append(by_ohm, np.zeros(self.p.size))
             slope -= basis @ (basis.T @ slope)
             square = max(float(slope @ slope), 1e-9 * float(by_ohm @ by_ohm))
             ohm = float(slope @ residual) / square
