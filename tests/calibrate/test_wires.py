@@ -297,7 +297,7 @@ def test_readings_under_weights_tell_the_wires() -> None:
     rest_ratio = circuit.readings(rest)[..., :4]
     with ohmskin.open("emulator://5x4", start=False) as board:
         calibrator = Calibrator(board.info, rest_ratio, "joint", 8e-5)
-    presses = calibrator.presses_in_readings(np.array(law, PRESS), np.array(ratios))
+    presses = calibrator.presses_in_table(np.array(law, PRESS), np.array(ratios))
     assert calibrator.found is not None
     assert calibrator.found.wires.both == pytest.approx((300.0, 600.0), rel=0.1)
     np.testing.assert_allclose(presses.rise, true, rtol=0.05)

@@ -342,17 +342,21 @@ class Calibrator:
         self.found = found
         self._tell(found.wires)
 
-    def presses_in_table(self, table: PressTable) -> Presses:
+    def presses_in_table(self, table: PressTable, ratios: Float | None = None) -> Presses:
         """The presses of a table, each of its rows one.
 
-        Raises ValueError, naming the row, for a cell that is not on the skin.
+        ratios: mean readings under each press, (n, R, C, 4), by whose wires the presses are seen;
+            None: they are not known.
+
+        Raises ValueError, naming the row, for a cell that is not on the skin; and where readings
+        show no press clearly.
         """
         rows, columns = self.board.rows, self.board.columns
         for number, (row, column) in enumerate(table[["row", "column"]].tolist(), start=2):
             with naming(f"row {number}"):
                 check_cell(row, column, (rows, columns))
         cells = table["row"] * columns + table["column"]
-        return Presses(
+        presses = Presses(
             cells=cells,
             rise=table["conductance"] - self.rest_level.flat[cells],
             rise_std=table["conductance_std"],
@@ -361,19 +365,13 @@ class Calibrator:
             scan=np.arange(cells.size),
             shape=(rows, columns),
         )
-
-    def presses_in_readings(self, table: PressTable, ratios: Float) -> Presses:
-        """The presses of a table, seen with the wires that their readings tell.
-
-        ratios: mean readings under each press, (n, R, C, 4). Raises ValueError as
-        `presses_in_table`, and where no press is clear.
-        """
-        presses = self.presses_in_table(table)
+        if ratios is None:
+            return presses
         if not self.shows_wires:
             self.learn_wires(ratios, presses, in_order=False)
-        seen = zip(ratios, presses.cells, strict=True)
+        seen = zip(ratios, cells, strict=True)
         rise = np.array([self.estimator.estimate(ratio).level.flat[cell] for ratio, cell in seen])
-        rise -= self.rest_level.flat[presses.cells]
+        rise -= self.rest_level.flat[cells]
         # The deviations in the table are of rises with other wires. As shares of the rise, they are
         # the same with these wires.
         return replace(presses, rise=rise, rise_std=presses.rise_std * np.abs(rise / presses.rise))

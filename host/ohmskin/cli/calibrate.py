@@ -153,7 +153,7 @@ def weights(
         TERMINAL.print(f"{done}: {command} goes on")
         raise typer.Exit(130)  # what a shell says of Ctrl-C
     with naming(kept.path):
-        presses = kept.seen_by(calibrator)
+        presses = calibrator.presses_in_table(kept.table, kept.ratios)
     _finish(calibrator, presses, kept.path, out)
 
 

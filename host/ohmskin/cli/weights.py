@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from ohmskin.arrays import Float
 from ohmskin.calibrate.guide import READING_S, Cells, Guide, Press, State, Step
-from ohmskin.calibrate.presses import Calibrator, Presses
+from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.rules import check_cell
 from ohmskin.calibrate.tables import PRESS, PressTable, load_press_table, save_press_table
 from ohmskin.cli.board import TERMINAL
@@ -86,12 +86,6 @@ class KeptPresses:
     def presses(self) -> list[Press]:
         """Cell and force of each."""
         return [Press((row, column), force_n) for row, column, force_n, *_ in self.table.tolist()]
-
-    def seen_by(self, calibrator: Calibrator) -> Presses:
-        """The presses, with the wires that their readings tell. Raises ValueError, of bad rows."""
-        if self.ratios is None:
-            return calibrator.presses_in_table(self.table)
-        return calibrator.presses_in_readings(self.table, self.ratios)
 
     def add(self, step: Step, rest: Float, window: Iterable[Scan]) -> None:
         """Keep one more press, which `step` has read from these scans.
