@@ -36,7 +36,7 @@ class Scripted:
                 value = course(scan / self.rate_hz) if callable(course) else course
                 rise[cell] = value * (1 + self.noise * self.random.standard_normal())
                 touched[cell] = True
-            steps.append(self.guide.feed(self.now_s, rise, touched))
+            steps.append(self.guide.feed(self.now_s, rise, touched, scan))
             self.now_s += 1 / self.rate_hz
         return steps
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ohmskin.arrays import Bool, Float
 from ohmskin.calibrate.presses import SECOND_SHARE
+from ohmskin.link.messages import Scan
 
 # Cells as (row, column).
 Cells = tuple[tuple[int, int], ...]
@@ -62,6 +63,7 @@ class Step(NamedTuple):
     rise: mean conductance of the cell above rest over the window [S], if this scan completes the
         press; else None.
     rise_std: standard error of that mean [S], from the scatter of the scans.
+    scans: those of the window, if this scan completes the press.
     """
 
     state: State
@@ -70,6 +72,7 @@ class Step(NamedTuple):
     change: float | None = None
     rise: float | None = None
     rise_std: float = math.nan
+    scans: Sequence[Scan] = ()
 
 
 def pressed_cells(rise: Float, touched: Bool) -> Cells:
@@ -148,9 +151,10 @@ class Guide:
         self._wanted = deque(wanted)
         self._on = OnSkin()
         self._is_read = False
-        self._window: deque[tuple[float, float]] = deque()  # times [s], rises of the wanted cell
+        # Times [s], rises of the wanted cell, scans.
+        self._window: deque[tuple[float, float, Scan]] = deque()
 
-    def feed(self, time_s: float, rise: Float, touched: Bool) -> Step:
+    def feed(self, time_s: float, rise: Float, touched: Bool, scan: Scan) -> Step:
         """One scan, in order: time on any clock [s]; rise above rest [S], touched (R, C)."""
         if self._window and time_s <= self._window[-1][0]:
             self._window.clear()  # the board was reset: its clock begins anew
@@ -169,7 +173,7 @@ class Guide:
         if cells != (press.cell,):
             return Step(State.WRONG if cells else State.PUT, press, cells)
         if pressed == cells:  # and not a glimpse of something else
-            self._window.append((time_s, float(rise[press.cell])))
+            self._window.append((time_s, float(rise[press.cell]), scan))
         return self._held(press)
 
     def _held(self, press: Press) -> Step:
@@ -179,14 +183,15 @@ class Guide:
             window.popleft()
         if len(window) < MIN_READING_SCANS or window[-1][0] - window[0][0] < READING_S:
             return step
-        x = np.array([rise for _, rise in window])
+        _, rises, scans = zip(*window, strict=True)
+        x = np.array(rises)
         change, is_steady = steady(x)
         step = step._replace(change=change)
         if not is_steady:
             return step
         self._is_read = True
         std = float(x.std(ddof=1)) / math.sqrt(x.size)
-        return step._replace(state=State.TAKE_OFF, rise=float(x.mean()), rise_std=std)
+        return step._replace(state=State.TAKE_OFF, rise=float(x.mean()), rise_std=std, scans=scans)
 
 
 def steady(x: Float) -> tuple[float, bool]:

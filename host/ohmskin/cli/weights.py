@@ -2,7 +2,6 @@
 """Leads a person who puts known weights on a skin, on cell after cell or anywhere."""
 
 import math
-from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -11,7 +10,7 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from ohmskin.arrays import Float
-from ohmskin.calibrate.guide import READING_S, Cells, Guide, Press, State, Step
+from ohmskin.calibrate.guide import Cells, Guide, Press, State, Step
 from ohmskin.calibrate.presses import Calibrator
 from ohmskin.calibrate.rules import check_cell
 from ohmskin.calibrate.tables import PRESS, PressTable, load_press_table, save_press_table
@@ -187,7 +186,6 @@ def guided(
     guide, rest = Guide(missing), calibrator.rest_level
     anywhere = isinstance(kept, KeptAnywhere)
     places = np.random.default_rng(0).uniform(0, np.array(rest.shape) - 1, (total + 1, 2)).tolist()
-    window: deque[Scan] = deque()  # the scans that a press is read from
     done, last_line, since_us = total - len(missing), "", math.inf
     columns = BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False)
     bar = Progress(*columns, console=TERMINAL, transient=True, disable=not TERMINAL.is_terminal)
@@ -201,17 +199,12 @@ def guided(
             if anywhere:
                 rise = np.sum(rise, where=touched, keepdims=True)
                 touched = np.array([[touched.any()]])
-            step = guide.feed(1e-6 * scan.time_us, rise, touched)
+            step = guide.feed(1e-6 * scan.time_us, rise, touched, scan)
             if skin.put is not None:  # a simulated skin: nobody else puts a weight on it
                 put = None if step.state is State.TAKE_OFF else step.wanted
                 skin.put(put if put is None or not anywhere else (places[done], put.force_n))
-            if window and scan.time_us <= window[-1].time_us:
-                window.clear()  # the board was reset: its clock begins anew
-            window.append(scan)
-            while 1e-6 * (scan.time_us - window[0].time_us) > READING_S:
-                window.popleft()
             if step.wanted is not None and step.rise is not None:
-                kept.add(step, rest, window)
+                kept.add(step, rest, step.scans)
                 done += 1
                 TERMINAL.bell()
             if step.state is not State.PUT or scan.time_us < since_us:
