@@ -3,7 +3,6 @@
 pseudo-terminal that is opened like a serial port, and the firmware in the AVR simulator.
 """
 
-import copy
 import gc
 import itertools
 import threading
@@ -12,23 +11,20 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ohmskin
-from ohmskin import errors
 from ohmskin.emulate.driver import EmulatorLink, SteppedLink, SteppedSkin
 from ohmskin.emulate.scenes import BEGIN_S, Scene
 from ohmskin.emulate.urls import emulated
-from ohmskin.errors import CommandRefused, DeviceLost, OhmskinError, PortError
+from ohmskin.errors import CommandRefused, DeviceLost, PortError
 from ohmskin.link import device, framing, protocol
 from ohmskin.link.messages import Scan
 from ohmskin.link.session import Session
 from ports import Serve
-from recordings import write_recording
 from stepped import stepped, stepped_link
 from waiting import until
 
@@ -408,30 +404,6 @@ def test_an_iterator_never_used_costs_nothing(monkeypatch: pytest.MonkeyPatch) -
         assert skin.stats.line.frames >= before.line.frames + 100  # `before` is a copy
 
 
-@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
-def test_a_mean_of_no_time_is_refused(seconds: float) -> None:
-    """That of NaN seconds went on for ever."""
-    with (
-        stepped("emulator://1x1?vanish=9") as skin,
-        pytest.raises(ValueError, match=rf"no mean of {seconds:g} seconds: say 0 or more"),
-    ):
-        skin.mean_ratio(seconds)
-
-
-def test_a_mean_is_not_of_less_time_than_was_asked_for(tmp_path: Path) -> None:
-    """A recording that was shorter gave that of all of it, its touches among them."""
-    path, board = tmp_path / "a.mcap", stepped("emulator://1x1?rate=5")
-    write_recording(path, board.info, [*itertools.islice(board, 5)])
-    for seconds in (0.0, 0.5, 1.0):
-        with ohmskin.open(f"replay://{path}?speed=0") as skin:
-            assert skin.mean_ratio(seconds).shape == (1, 1, 4)
-    with (
-        ohmskin.open(f"replay://{path}?speed=0") as skin,
-        pytest.raises(ValueError, match=r"no mean of 2 seconds: replay.* ends before"),
-    ):
-        skin.mean_ratio(2.0)
-
-
 def test_latest_waits_as_long_as_told() -> None:
     with stepped("emulator://1x1?rate=1") as skin:
         skin.start()
@@ -615,15 +587,3 @@ def test_commands_of_two_threads_are_kept_apart(monkeypatch: pytest.MonkeyPatch)
         other.join()
     assert early == [False]
     assert written.is_set()
-
-
-def test_every_error_can_go_to_another_process() -> None:
-    """A pool of processes waited for ever: it could not make a refused command anew."""
-    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
-    kinds = [kind for kind in kinds if issubclass(kind, OhmskinError)]
-    assert CommandRefused in kinds
-    for kind in kinds:
-        told = ("start", "busy", "so") if kind is CommandRefused else ("what", "why")
-        one = kind(*told)
-        again = copy.copy(one)  # as a process makes it anew
-        assert (type(again), str(again), vars(again)) == (kind, str(one), vars(one))

@@ -333,7 +333,9 @@ def _chosen(board: str, port: str, attached: list[SerialPort]) -> tuple[str, str
 
 
 def _answer(find_port: Callable[[], str], seconds: float) -> tuple[str, Hello]:
-    """The port of the flashed board, and what the board says of itself. It may take so long.
+    """The port of the flashed board, and what the board says of itself.
+
+    seconds: how long it may take until the port is there, and the board answers [s].
 
     As after every reset, it is in its boot loader for up to 3 s, and its port may be gone
     meanwhile.
